@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgeperc import Perceiver, cli
+from cli_helpers import Shell
+from edgeperc import Perceiver
 from edgeperc.errors import OptionError
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.types.card import ModelCard
@@ -57,19 +58,16 @@ def test_a_perceiver_takes_them() -> None:
     assert any(box.label == "car" for box in perception.boxes)
 
 
-def test_weights_and_models_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_and_models_exclude_each_other(tmp_path: Path, shell: Shell) -> None:
     with pytest.raises(OptionError, match="weights is 'open', and models="):
         Perceiver("pointseg", weights="open")
     with pytest.raises(OptionError, match="weights is 'opne' \\(did you mean open"):
         Perceiver(weights="opne")
     (tmp_path / "scan.bin").write_bytes(bytes(16 * 100))
-    with pytest.raises(SystemExit):
-        cli.main(["run", str(tmp_path / "scan.bin"), "--model", "pointseg", "--weights", "open"])
-    assert "both name models" in capsys.readouterr().err
+    assert "both name models" in shell.err("run", tmp_path / "scan.bin", "--model", "pointseg", "--weights", "open")
 
 
-def test_the_program_takes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_program_takes_them(tmp_path: Path, shell: Shell) -> None:
     simulated_scan(FIRST_SEED).points.tofile(tmp_path / "scan.bin")
-    assert cli.main(["run", str(tmp_path / "scan.bin"), "--weights", "open", "--json", "--threads", "1"]) == 0
-    said = capsys.readouterr().out
+    said = shell.out("run", tmp_path / "scan.bin", "--weights", "open", "--json", "--threads", "1")
     assert all(ModelCard.read(resolve(name)[0].path).name in said for name in OPEN)

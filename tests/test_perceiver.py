@@ -15,6 +15,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -164,11 +165,8 @@ def test_openvino_runs_both_networks_at_once_too(two_cores: None, scan: Simulate
 def test_a_network_that_fails_beside_another_ends_the_call(
     monkeypatch: pytest.MonkeyPatch, both: Perceiver, perception: Perception, scan: SimulatedScan, failing: int
 ) -> None:
-    def fail() -> None:
-        raise InferenceError("no memory left")
-
     with monkeypatch.context() as broken:
-        broken.setattr(both.sessions[failing], "run", fail)
+        broken.setattr(both.sessions[failing], "run", Mock(side_effect=InferenceError("no memory left")))
         with pytest.raises(InferenceError, match="no memory left"):
             both(scan.points)
     assert_same(perception, both(scan.points))
@@ -206,12 +204,8 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
     n_lanes = sum(thread.name.startswith("edgeperc-lane") for thread in threading.enumerate())
     options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": alone == "full_turn"}
     both = Perceiver(["ssadnet", "pointseg"], **options)
-
-    def refuse(_: object) -> None:
-        raise RuntimeError("can't start new thread")
-
     with monkeypatch.context() as limited:
-        limited.setattr(threading.Thread, "start", refuse)
+        limited.setattr(threading.Thread, "start", Mock(side_effect=RuntimeError("can't start new thread")))
         for _ in range(2):
             assert_same(known, both(scan.points))
     for _ in range(2):

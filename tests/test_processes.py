@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from checkout import printed
 from cli_helpers import run
 from edgeperc import EdgepercError, Perceiver
 from edgeperc.inference.providers import available_providers
@@ -48,10 +49,10 @@ def folder(scan: NDArray[np.float32], tmp_path: Path) -> Path:
     return folder
 
 
-def python(code: str, *arguments: str, timeout_s: float = 120.0, **options: Any) -> subprocess.CompletedProcess[str]:
+def python(code: str, *arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run Python; a process that hangs fails the test."""
     command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, **options)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
 
 
 FORK = """
@@ -127,9 +128,7 @@ def test_a_fork_works_without_threads_and_is_refused_at_once_where_it_cannot_wor
         ("between calls", {"provider": "openvino", "n_threads": 1}),
     ]
     refused = [case for case in refused if case[1]["provider"] in available_providers()]
-    done = python(FORK, json.dumps([*works, *refused]))
-    assert done.returncode == 0, done.stderr
-    answers = done.stdout.splitlines()
+    answers = printed(FORK, json.dumps([*works, *refused]), timeout=120).splitlines()
     assert answers[: len(works)] == ["equal"] * len(works)
     why = "construct the Perceiver in the process that calls it"
     assert [why in answer for answer in answers[len(works) :]] == [True] * len(refused)
@@ -179,10 +178,8 @@ sys.exit(process.exitcode)
 @posix
 def test_a_fork_ends() -> None:
     """Its copies of threads, of which there are none, are not waited for."""
-    done = python(END)
-    assert done.returncode == 0, done.stderr
     hows = ["exit", "dropped", "forked again", "forked again", "with its own", "cyclic", "multiprocessing"]
-    assert done.stdout.splitlines() == hows
+    assert printed(END, timeout=120).splitlines() == hows
 
 
 DAEMON = f"""{MADE}
@@ -252,8 +249,7 @@ def test_the_interpreter_ends_after_a_call(how: str) -> None:
 
 def test_a_daemon_thread_in_a_call_ends_with_the_interpreter() -> None:
     """Whatever it does then. Forks that have a perceiver of their own stand for other processes."""
-    done = python(DAEMON)
-    assert done.returncode == 0, done.stderr
+    printed(DAEMON, timeout=120)
 
 
 def test_perceivers_are_not_pickled_or_copied() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import twins.rules
 from edgeperc import Box, Perceiver, PointLabels, PointsError, TopView
+from edgeperc.agreement import votes as voting
 from edgeperc.agreement.cells import clear_cells, fill_marks
 from edgeperc.agreement.rules import (
     RULES,
@@ -29,23 +30,6 @@ from edgeperc.agreement.rules import (
     find_voters,
     stand_boxes,
     sum_inside,
-)
-from edgeperc.agreement.votes import (
-    CLUSTER,
-    EVERYTHING,
-    MAX_LENGTH_M,
-    MAX_TOP_M,
-    MIN_LARGE_SHARE,
-    MIN_VEHICLE_SHARE,
-    Applied,
-    Cells,
-    Sight,
-    Tallies,
-    apply_verdicts,
-    fill_tallies,
-    fill_verdicts,
-    fill_votes,
-    find_persons_alone,
 )
 from edgeperc.ground.planes import Ground, find_ground
 from edgeperc.ground.scan import Scan
@@ -145,11 +129,11 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
 @given(scenes, st.sampled_from([(0, 0), (40, 40)]))
 def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
-    found = Tallies(np.empty(6, CLUSTER), np.empty((6, 5), np.int32))
+    found = voting.Tallies(np.empty(6, voting.CLUSTER), np.empty((6, 5), np.int32))
     cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
     args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
     grid = Grid(16.0, 8.0, 0.4)
-    fill_tallies(scene.cloud, *args[2:5], Cells(*args[5:], grid), found)
+    voting.fill_tallies(scene.cloud, *args[2:5], voting.Cells(*args[5:], grid), found)
     counts, bounds, above = twins.rules.tallies(*args, grid, 6, 4)
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(structured_to_unstructured(found.clusters[BOUNDS]), bounds)
@@ -187,11 +171,11 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     scores, names = rng.random(n).astype(np.float32), rng.integers(0, 4, n).astype(np.uint8)
     in_view, clusters = scene.in_view, scene.clusters
     found = scene.labels.copy()
-    apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
+    voting.apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
     right = twins.rules.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
     np.testing.assert_array_equal(found, right)
     votes = np.empty(n, np.uint8)
-    fill_votes(scene.in_view, Labeled(scene.labels, ROLES), scores, votes)
+    voting.fill_votes(scene.in_view, Labeled(scene.labels, ROLES), scores, votes)
     np.testing.assert_array_equal(votes, twins.rules.votes(scene.in_view, scene.labels, ROLES, scores))
 
 
@@ -208,11 +192,11 @@ def test_what_becomes_of_clusters_matches_the_twin(
     bounds = np.column_stack([-sides / 2, sides / 2, rng.choice([-np.inf, 0.4, 0.9, 1.5, 2.2, 4.5], n)])
     bounds = bounds.astype(np.float32)
     parts, refused, found = np.array([[2, 3]]), rng.random(n) < 0.2, np.empty((n, 4), np.uint8)
-    clusters = np.zeros(n, CLUSTER)
+    clusters = np.zeros(n, voting.CLUSTER)
     for name, column in zip(BOUNDS, bounds.T, strict=True):
         clusters[name] = column
-    sight = Sight(*rng.choice([(0.3, 0.035), (0.5, -0.1), (1.73, 0.2), (math.inf, 0.0)]).tolist())
-    fill_verdicts(Tallies(clusters, counts), refused, ROLES, parts, Applied(*rules), sight, found)
+    sight = voting.Sight(*rng.choice([(0.3, 0.035), (0.5, -0.1), (1.73, 0.2), (math.inf, 0.0)]).tolist())
+    voting.fill_verdicts(voting.Tallies(clusters, counts), refused, ROLES, parts, voting.Applied(*rules), sight, found)
     right = twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules, *sight)
     np.testing.assert_array_equal(found, right)
 
@@ -294,7 +278,7 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     in_box = np.random.default_rng(len(given)).random(cells.shape) < 0.3
     drivable, marks = 1 if of_road else 255, np.zeros(cells.shape, np.uint8)
     labeled = Labeled(scene.labels, ROLES)
-    fill_marks(scene.cloud, scene.in_view, labeled, by_height, Cells(cells, is_vehicle, grid), marks)
+    fill_marks(scene.cloud, scene.in_view, labeled, by_height, voting.Cells(cells, is_vehicle, grid), marks)
     clear_cells(marks, np.flatnonzero(marks), drivable, is_vehicle, in_box, found)
     args = *scene.cloud, scene.in_view, *labeled, by_height, grid, drivable, is_vehicle, in_box, cells
     np.testing.assert_array_equal(found, twins.rules.cells(*args))
@@ -320,8 +304,8 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
             continue
         share = np.mean(scene.labels[own & scene.in_view] == 1) if (own & scene.in_view).any() else 0.0
         length = np.hypot(*(np.ptp(scene.points[own, c].astype(np.float64)) for c in range(2)))
-        is_large = length > MAX_LENGTH_M + 1e-3 or np.max(scene.height[own], initial=-np.inf) > MAX_TOP_M
-        if share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE):
+        is_large = length > voting.MAX_LENGTH_M + 1e-3 or np.max(scene.height[own], initial=-np.inf) > voting.MAX_TOP_M
+        if share < (voting.MIN_LARGE_SHARE if is_large else voting.MIN_VEHICLE_SHARE):
             assert not (agreed.labels[own & ~boxed] == 1).any()
     again = agreed_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
     np.testing.assert_array_equal(agreed.labels, again.labels)
@@ -408,7 +392,7 @@ def agreed_scene(
     *parts: NDArray[np.float64],
     boxes: tuple[Box, ...] = (),
     view: TopView | None = None,
-    sight: Sight = EVERYTHING,
+    sight: voting.Sight = voting.EVERYTHING,
     rules: frozenset[str] = RULES,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
@@ -519,11 +503,11 @@ def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
     for yaw in (0.0, 0.7, 2.4):
         points[: len(person), :2] = person[:, :2] @ [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
         before, after = rows[:, 3].astype(np.uint8), np.zeros(len(rows), np.uint8)
-        (own,) = find_persons_alone(Cloud(points, height), ROLES, before, after)
+        (own,) = voting.find_persons_alone(Cloud(points, height), ROLES, before, after)
         np.testing.assert_array_equal(own, np.arange(len(person)))
         for n in (0, 1, 29):
             few = Cloud(points[:n], height[:n])
-            assert find_persons_alone(few, ROLES, before[:n], after[:n]) == []
+            assert voting.find_persons_alone(few, ROLES, before[:n], after[:n]) == []
 
 
 def test_parts_of_a_hedge_are_no_persons() -> None:
@@ -561,8 +545,10 @@ def test_near_table_is_no_car() -> None:
     assert (labels[(rows[:, 2] > 0.0) & ~is_near] == 1).all()
 
 
-@pytest.mark.parametrize(("sight", "n_kept"), [(Sight(0.3, 0.035), 2), (Sight(1.73, 0.035), 0), (EVERYTHING, 0)])
-def test_a_low_sensor_sees_the_lower_half_of_a_car_and_the_legs_of_a_person(sight: Sight, n_kept: int) -> None:
+@pytest.mark.parametrize(
+    ("sight", "n_kept"), [(voting.Sight(0.3, 0.035), 2), (voting.Sight(1.73, 0.035), 0), (voting.EVERYTHING, 0)]
+)
+def test_a_low_sensor_sees_the_lower_half_of_a_car_and_the_legs_of_a_person(sight: voting.Sight, n_kept: int) -> None:
     rows, labels = agreed_scene(
         block(8.0, 3.0, (3.9, 1.7, 0.55), 1), block(8.0, -4.0, (0.5, 0.4, 0.55), 2, 0.1), sight=sight
     )

@@ -511,15 +511,12 @@ def test_scaling_measures_points_cars_sizes_and_processes(
     ET.fromstring(plot.read_text())
 
 
-def test_a_soak_reports_memory(
-    in_process: list[worker.Job], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["soak", "--scans", "1000", "--json", str(tmp_path / "s.json")]) == 0
+def test_a_soak_reports_memory(in_process: list[worker.Job], tmp_path: Path, shell: Shell) -> None:
+    assert "Memory over a long run" in shell.out("soak", "--scans", "1000", "--json", tmp_path / "s.json")
     measured = read_report(tmp_path / "s.json")
     timings = measured["settings"][0]["repeats"][0]["scenarios"]["soak"]
     assert (timings["n"], len(timings["warm_up_ms"]), len(timings["ms"])) == (900, 100, 450)
     assert measured["soak"] == memory_growth(timings["rss_mb"], 100)
-    assert "Memory over a long run" in capsys.readouterr().out
 
 
 def test_a_report_is_written_though_nobody_reads_it(

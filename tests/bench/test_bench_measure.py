@@ -7,7 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -222,10 +223,7 @@ def test_the_machine_is_described_in_json(psutil: None) -> None:
 
 @pytest.mark.parametrize("name", ["cpu_freq", "sensors_temperatures", "sensors_battery"])
 def test_a_container_without_sys_is_described(psutil: None, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails() -> NoReturn:
-        raise FileNotFoundError("/sys/class/power_supply")
-
-    monkeypatch.setattr(f"psutil.{name}", fails, raising=False)
+    monkeypatch.setattr(f"psutil.{name}", Mock(side_effect=FileNotFoundError("/sys/class/power_supply")), raising=False)
     json.dumps([context.machine(), context.conditions()], allow_nan=False)
     shown = {"cpu_freq": "mhz", "sensors_temperatures": "temperature_c", "sensors_battery": "on_battery"}[name]
     assert context.conditions()[shown] is None

@@ -16,6 +16,7 @@ import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -210,11 +211,7 @@ def test_a_program_runs_in_any_thread() -> None:
 @posix
 def test_a_broken_pipe_to_a_process_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     """Only a closed stdout or stderr is quiet."""
-
-    def command() -> int:
-        raise BrokenPipeError(32, "Broken pipe")
-
-    assert run_program("program", command) == 2
+    assert run_program("program", Mock(side_effect=BrokenPipeError(32, "Broken pipe"))) == 2
     assert "Broken pipe" in capsys.readouterr().err
 
 

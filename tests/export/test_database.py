@@ -33,7 +33,7 @@ from shapely import Polygon
 import twins.database
 from cli_helpers import Shell
 from edgeperc.datasets.kitti import KittiObjects
-from edgeperc.errors import CardMismatchError, MissingExtraError
+from edgeperc.errors import CardMismatchError
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.system.atomic import write_atomic
@@ -406,14 +406,6 @@ def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Pa
     path.write_text(write_coco({"000000": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
     with pytest.raises(DatabaseError, match="draw roads in two drives"):
         build(plan, polygons=[path], recipe=recipe, workers=1)
-
-
-def test_without_ray_the_extra_is_named(
-    kitti: Path, model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"edgeperc\[ray\]"):
-        build(plan_of(kitti, tmp_path / "out", model), engine="ray", workers=2)
 
 
 class PowerFailure(BaseException):

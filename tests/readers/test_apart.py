@@ -21,6 +21,7 @@ from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -565,12 +566,8 @@ def test_a_scan_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_too_little_memory_for_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     POINTS.tofile(tmp_path / "a.bin")
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise MemoryError
-
     for name in ("fromfile", "abs"):
         with monkeypatch.context() as patch:
-            patch.setattr(files.np, name, fail)
+            patch.setattr(files.np, name, Mock(side_effect=MemoryError))
             with pytest.raises(PointsError, match=r"a\.bin: .*(cannot be read|more memory than there is)"):
                 read_points(tmp_path / "a.bin")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -539,11 +540,7 @@ def test_what_the_system_refuses_is_a_typed_error(
     assert not is_capture(tmp_path / ("a" * 300))
     with pytest.raises(PointsError, match=r"a: (the file cannot be read|there is no such file)"):
         read(tmp_path / ("a" * 300))
-
-    def refuse(self: Path) -> bool:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "is_file", refuse)
+    monkeypatch.setattr(Path, "is_file", Mock(side_effect=PermissionError(13, "Permission denied")))
     (tmp_path / "b.bin").touch()
     with pytest.raises(PointsError, match=r"the folder cannot be read \(.*Permission denied"):
         read(tmp_path)

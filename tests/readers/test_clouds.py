@@ -13,6 +13,7 @@ from capture_writers import mcap_channel, mcap_message, write_records
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_captures import FLOATS, POINTS, cloud, messages
+from tiny_model import varint
 
 from edgeperc.errors import PointsError
 from edgeperc.readers.captures import read_scans
@@ -80,13 +81,6 @@ def test_any_bytes_are_a_cloud_or_a_typed_error(kind: tuple[str, str], content: 
 
 
 # --- Foxglove --------------------------------------------------------------------------------------------------------
-
-
-def varint(value: int) -> bytes:
-    out = b""
-    while value > 127:
-        out, value = out + bytes([value & 127 | 128]), value >> 7
-    return out + bytes([value])
 
 
 def part(number: int, value: int | bytes) -> bytes:

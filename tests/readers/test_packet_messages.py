@@ -20,8 +20,8 @@ from test_ouster_packets import METADATA, random_packets
 from test_ouster_packets import record as write_capture
 
 from cli_helpers import Shell
-from edgeperc import MissingExtraError, PointsError, SensorError, read_scans, read_timed_scans, sensor_of
-from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneScan, VelodyneStream
+from edgeperc import PointsError, SensorError, read_scans, read_timed_scans, sensor_of
+from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneScan
 from edgeperc.types.sensor import SENSORS
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -231,12 +231,6 @@ def test_the_scans_before_the_damage_come(tmp_path: Path) -> None:
         for _, points in read_scans(path):
             scans.append(points)
     assert sum(map(len, scans)) == 75 * (len(packets) // 75) * 12 * 32
-
-
-def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "velodyne_decoder", None)
-    with pytest.raises(MissingExtraError, match=r"edgeperc\[velodyne\]"):
-        VelodyneStream()
 
 
 def ouster_bag(folder: Path, version: str, packets: Sequence[bytes], metadata: str) -> Path:

@@ -18,16 +18,7 @@ from test_captures import check_beside, error_of
 
 import twins.packets
 from edgeperc import PointsError, read_timed_scans, sensor_of
-from edgeperc.readers.spinning_packets import (
-    FORMATS,
-    Angles,
-    SpinningStream,
-    angles_of_difop,
-    fill_returns,
-    format_of,
-    name_of,
-    read_angles,
-)
+from edgeperc.readers import spinning_packets
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -50,7 +41,7 @@ LENS_M = {
 
 def fires_of(model: Model) -> NDArray[np.float64]:
     """(blocks, channels); of the models without a formula above, as the table has them."""
-    given_us = np.asarray(FIRES_US.get(model.name, FORMATS[model.name].fires_us))
+    given_us = np.asarray(FIRES_US.get(model.name, spinning_packets.FORMATS[model.name].fires_us))
     if model.second == "lasers":
         return np.stack([given_us[48 * (k % 2) :][:48] for k in range(model.blocks)])
     return np.broadcast_to(given_us, (model.blocks, model.channels))
@@ -155,7 +146,7 @@ def test_without_angles_it_says_what_is_missing(tmp_path: Path, name: str) -> No
     blocks = blocks_of(model, *ranges(model, 2 * model.blocks))
     path = write_pcap(tmp_path / "drive.pcap", packets_of(model, blocks))
     error = error_of(path)
-    assert f"the angles of the lasers of this {FORMATS[name].title} are not known" in error
+    assert f"the angles of the lasers of this {spinning_packets.FORMATS[name].title} are not known" in error
     assert "drive.csv" in error
     assert ("DIFOP" in error) == (model.layout == ">")
     (tmp_path / "drive_angles.csv").write_text(calibration(unit_angles(model)))
@@ -188,7 +179,7 @@ def test_calibrations_that_are_none(tmp_path: Path, text: str, n: int) -> None:
     path = tmp_path / "a.csv"
     path.write_text(text, encoding="latin-1")
     with pytest.raises(PointsError, match=rf"a\.csv has {n} rows .*expected 40"):
-        read_angles(path, FORMATS["pandar40p"])
+        spinning_packets.read_angles(path, spinning_packets.FORMATS["pandar40p"])
 
 
 def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
@@ -252,19 +243,19 @@ def test_models_that_are_not_decoded_are_named(tmp_path: Path, name: str, packet
 @pytest.mark.parametrize("model", MODELS.values(), ids=[*MODELS])
 def test_formats_are_told_apart(model: Model) -> None:
     (packet, *_) = packets_of(model, blocks_of(model, *ranges(model, 2 * model.blocks)))
-    row = format_of(memoryview(packet))
+    row = spinning_packets.format_of(memoryview(packet))
     same = "helios-32" if model.name == "helios-16" else model.name  # which the DIFOP tells apart
     assert row.name == same
-    assert name_of(memoryview(packet)) == FORMATS[same].title
+    assert spinning_packets.name_of(memoryview(packet)) == spinning_packets.FORMATS[same].title
     for cut in (0, 5, 30, len(packet) // 2, len(packet) - 30):
-        assert format_of(memoryview(packet[:cut])) is None
+        assert spinning_packets.format_of(memoryview(packet[:cut])) is None
 
 
 @settings(max_examples=60)
 @given(st.sampled_from([*MODELS]), st.integers(0, 4), st.integers(0, 2**31))
 def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> None:
     """On any bytes, and blocks that are not finite."""
-    row, rng = FORMATS[name], np.random.default_rng(seed)
+    row, rng = spinning_packets.FORMATS[name], np.random.default_rng(seed)
     size = row.header + row.n_blocks * row.block_bytes
     packets = rng.integers(0, 4, (n_packets, size)).astype(np.uint8)
     blocks = rng.choice([0.0, 10.0, 10.2, 359.0, np.nan, np.inf, 1e9], (n_packets, row.n_blocks, 3))
@@ -274,7 +265,7 @@ def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> No
     places = (row.header, row.block_bytes, row.first, row.channel_bytes, int(rng.integers(2)), row.mask, *back)
     points = np.full((n_packets * row.n_blocks * row.n_channels, 4), 7.0, np.float32)
     times_s = np.full(len(points), 7.0)
-    n = fill_returns(packets, np.array(places), blocks, beams, lens, points, times_s)
+    n = spinning_packets.fill_returns(packets, np.array(places), blocks, beams, lens, points, times_s)
     wanted, wanted_s = twins.packets.spinning_returns(packets, places, blocks, beams, lens)
     assert n == len(wanted)
     np.testing.assert_allclose(points[:n], wanted, rtol=1e-5, atol=1e-5)
@@ -286,17 +277,19 @@ def test_the_kernel_as_its_slow_twin(name: str, n_packets: int, seed: int) -> No
 @given(st.sampled_from([*MODELS]), st.integers(0, 2**31), st.lists(st.integers(0, 1247), max_size=30))
 def test_damaged_packets_give_finite_points(name: str, seed: int, places: list[int]) -> None:
     model, rng = MODELS[name], np.random.default_rng(seed)
-    stream = SpinningStream(FORMATS[name], Angles(unit_angles(model)))
+    stream = spinning_packets.SpinningStream(
+        spinning_packets.FORMATS[name], spinning_packets.Angles(unit_angles(model))
+    )
     packets = packets_of(model, blocks_of(model, *ranges(model, 6 * model.blocks)))
     scans = []
     for packet in packets:
         damaged = bytearray(packet)
         for at in places:
             damaged[at % len(damaged)] = int(rng.integers(256))
-        row = format_of(memoryview(damaged))
+        row = spinning_packets.format_of(memoryview(damaged))
         if row is not None and len(damaged) == len(packet) and (name != "ot128" or row.channel_bytes == 4):
             if name == "ot128" and not scans:
-                stream = SpinningStream(row, Angles(unit_angles(model)))
+                stream = spinning_packets.SpinningStream(row, spinning_packets.Angles(unit_angles(model)))
             scans += stream.add(memoryview(damaged))
     scans += stream.end()
     for scan in scans:
@@ -308,12 +301,14 @@ def test_damaged_packets_give_finite_points(name: str, seed: int, places: list[i
 def test_difop_of_any_bytes(name: str, content: bytes) -> None:
     model = MODELS[name]
     whole = difop(model, unit_angles(model))
-    angles = angles_of_difop(FORMATS[name], memoryview(whole))
+    angles = spinning_packets.angles_of_difop(spinning_packets.FORMATS[name], memoryview(whole))
     np.testing.assert_allclose(angles.lasers_deg, unit_angles(model), atol=1e-9)
-    assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + bytes(1240))) is None
-    assert angles_of_difop(FORMATS[name], memoryview(whole[:8] + b"\xff" * 1240)) is None
+    assert spinning_packets.angles_of_difop(spinning_packets.FORMATS[name], memoryview(whole[:8] + bytes(1240))) is None
+    assert (
+        spinning_packets.angles_of_difop(spinning_packets.FORMATS[name], memoryview(whole[:8] + b"\xff" * 1240)) is None
+    )
     damaged = whole[:465] + content + whole[465 + len(content) :]
-    found = angles_of_difop(FORMATS[name], memoryview(damaged))
+    found = spinning_packets.angles_of_difop(spinning_packets.FORMATS[name], memoryview(damaged))
     assert found is None or (np.abs(found.lasers_deg) <= 90.0).all()
 
 

@@ -11,24 +11,7 @@ from numpy.typing import NDArray
 from shapely import LineString, Polygon, box, coverage_union_all
 
 import twins.outline
-from edgeperc.road.outline import (
-    Outline,
-    fill_grown,
-    fill_rings,
-    filled,
-    mark_connected,
-    mark_needed,
-    may_change,
-    meet,
-    merge_corners,
-    nearest_part,
-    outline_of,
-    resolve_contacts,
-    rings_of,
-    row_sums,
-    turn,
-    without_gaps,
-)
+from edgeperc.road import outline as outlines
 
 MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
 
@@ -47,14 +30,14 @@ def streets(draw: st.DrawFn, most: int = 40) -> NDArray[np.bool_]:
 def traced(cells: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[NDArray[np.int64]]]:
     """The nearest part of padded cells, and its rings."""
     grid = np.pad(cells, 1)
-    part = without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
-    return part, rings_of(part)
+    part = outlines.without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
+    return part, outlines.rings_of(part)
 
 
 @given(MASKS, st.floats(0.0, 12.0))
 def test_cells_grow_by_a_disc(cells: NDArray[np.bool_], radius: float) -> None:
     grown = ~cells
-    fill_grown(cells, radius, grown)
+    outlines.fill_grown(cells, radius, grown)
     np.testing.assert_array_equal(grown, twins.outline.grown(cells, radius))
 
 
@@ -64,7 +47,7 @@ def test_cells_grow_by_a_disc(cells: NDArray[np.bool_], radius: float) -> None:
 def test_no_two_cells_share_only_a_corner(cells: NDArray[np.bool_], seed: int) -> None:
     addable = np.random.default_rng(seed).random(cells.shape) < 0.5
     expected = twins.outline.without_contacts(cells, addable)
-    resolve_contacts(cells, addable)
+    outlines.resolve_contacts(cells, addable)
     np.testing.assert_array_equal(cells, expected)
     a, b, c, d = cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]
     assert not ((a == d) & (b == c) & (a != b)).any()
@@ -75,7 +58,7 @@ def test_connected_cells_share_sides(cells: NDArray[np.bool_], data: st.DataObje
     row, col = (data.draw(st.integers(0, n - 1)) for n in cells.shape)
     cells[row, col] = True
     part = np.ones_like(cells)
-    mark_connected(cells, row, col, part)
+    outlines.mark_connected(cells, row, col, part)
     np.testing.assert_array_equal(part, twins.outline.connected(cells, row, col))
 
 
@@ -84,7 +67,7 @@ def test_rings_trace_every_side_once_with_the_cells_on_the_left(cells: NDArray[n
     padded = np.pad(cells, 1)
     sides = twins.outline.sides(padded)
     corners, ends = np.empty((len(sides), 2), np.int64), np.empty(len(sides) // 4 + 1, np.int64)
-    n_rings = fill_rings(padded, corners, ends)
+    n_rings = outlines.fill_rings(padded, corners, ends)
     walked: list[tuple[tuple[int, int], tuple[int, int]]] = []
     begin = 0
     for end in ends[:n_rings].tolist():
@@ -114,7 +97,7 @@ def test_corners_are_removed_as_by_the_twin(cells: NDArray[np.bool_], data: st.D
     outer, enough = data.draw(st.integers(0, len(rings) - 1)), data.draw(st.integers(3, 12))
     corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     kept = np.ones(len(corners), np.bool_)
-    mark_needed(corners, ends, row_sums(addable), row_sums(removable), outer, enough, kept)
+    outlines.mark_needed(corners, ends, outlines.row_sums(addable), outlines.row_sums(removable), outer, enough, kept)
     found = [ring[few].tolist() for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
     expected = twins.outline.needed([map(tuple, ring.tolist()) for ring in rings], addable, removable, outer, enough)
     assert found == [[list(corner) for corner in ring] for ring in expected]
@@ -128,8 +111,8 @@ CORNERS = st.tuples(st.integers(0, 9), st.integers(0, 9))
 def test_cells_that_a_triangle_touches(triangle: tuple[tuple[int, int], ...], fixed: NDArray[np.bool_]) -> None:
     touched = Polygon(triangle).intersection(shape_of(fixed)).area > 1e-9
     if Polygon(triangle).area > 0.0:
-        assert may_change(*np.ravel(triangle).tolist(), row_sums(~fixed)) == (not touched)
-    assert abs(turn(*np.ravel(triangle).tolist())) == pytest.approx(2.0 * Polygon(triangle).area)
+        assert outlines.may_change(*np.ravel(triangle).tolist(), outlines.row_sums(~fixed)) == (not touched)
+    assert abs(outlines.turn(*np.ravel(triangle).tolist())) == pytest.approx(2.0 * Polygon(triangle).area)
 
 
 @pytest.mark.kernel
@@ -137,7 +120,7 @@ def test_cells_that_a_triangle_touches(triangle: tuple[tuple[int, int], ...], fi
 def test_edges_that_meet(ends: tuple[tuple[int, int], ...]) -> None:
     a, b, c, d = ends
     if a != b and c != d:
-        assert meet(*np.ravel(ends).tolist()) == LineString([a, b]).intersects(LineString([c, d]))
+        assert outlines.meet(*np.ravel(ends).tolist()) == LineString([a, b]).intersects(LineString([c, d]))
 
 
 @settings(max_examples=40)
@@ -148,19 +131,19 @@ def test_corners_are_merged_as_by_the_twin(cells: NDArray[np.bool_], data: st.Da
         return
     random = np.random.default_rng(data.draw(st.integers(0, 99)))
     changeable = random.random(part.shape) < data.draw(st.sampled_from([0.0, 0.7, 0.9, 1.0]))
-    changeable &= part | ~filled(part)  # otherwise a hole may come outside
+    changeable &= part | ~outlines.filled(part)  # otherwise a hole may come outside
     around, enough = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 12))
     outer, *holes = sorted(rings, key=lambda ring: -Polygon(ring).area)
     edges = np.concatenate([*(np.hstack([hole, np.roll(hole, -1, 0)]) for hole in holes), np.empty((0, 4), np.int64)])
     ring = outer.copy()
-    few = ring[: merge_corners(ring, edges, row_sums(changeable), around, enough)]
+    few = ring[: outlines.merge_corners(ring, edges, outlines.row_sums(changeable), around, enough)]
     expected = twins.outline.merged(list(map(tuple, outer.tolist())), edges.tolist(), changeable, around, enough)
     assert list(map(tuple, few.tolist())) == expected
     assert Polygon(few, holes).is_valid
     assert Polygon(few).symmetric_difference(Polygon(outer)).intersection(shape_of(~changeable)).area < 1e-9
 
 
-def polygon_of(outline: Outline) -> Polygon:
+def polygon_of(outline: outlines.Outline) -> Polygon:
     return Polygon(outline.outer, outline.holes)
 
 
@@ -177,7 +160,7 @@ def test_polygons_are_valid(
     few = tuple(min(sizes) for sizes in zip(cells.shape, others.shape, strict=True))
     objects[: few[0], : few[1]] = ~others[: few[0], : few[1]]
     cells &= ~objects
-    found = outline_of(cells, (row, 5.0), objects, objects, tolerance=tolerance, max_corners=max_corners)
+    found = outlines.outline_of(cells, (row, 5.0), objects, objects, tolerance=tolerance, max_corners=max_corners)
     if not cells.any():
         assert found.outer.shape == (0, 2)
         assert found.holes == ()
@@ -198,8 +181,8 @@ def test_polygons_are_valid(
 @settings(max_examples=40)
 @given(streets(30), st.floats(1.0, 5.0), st.integers(4, 1000))
 def test_polygons_are_near_the_cells(cells: NDArray[np.bool_], tolerance: float, max_corners: int) -> None:
-    found = outline_of(cells, (40.0, 20.0), ~cells, ~cells, tolerance=tolerance, max_corners=max_corners)
-    loose = outline_of(cells, (40.0, 20.0), cells, ~cells, tolerance=tolerance, max_corners=max_corners)
+    found = outlines.outline_of(cells, (40.0, 20.0), ~cells, ~cells, tolerance=tolerance, max_corners=max_corners)
+    loose = outlines.outline_of(cells, (40.0, 20.0), cells, ~cells, tolerance=tolerance, max_corners=max_corners)
     if not cells.any():
         return
     edges = shape_of(cells).boundary
@@ -213,7 +196,7 @@ def test_polygons_are_near_the_cells(cells: NDArray[np.bool_], tolerance: float,
 @given(streets(20), st.integers(4, 12))
 def test_the_outline_has_few_corners(cells: NDArray[np.bool_], max_corners: int) -> None:
     nothing = np.zeros_like(cells)
-    found = outline_of(cells, (0.0, 0.0), nothing, nothing, tolerance=2.0, max_corners=max_corners)
+    found = outlines.outline_of(cells, (0.0, 0.0), nothing, nothing, tolerance=2.0, max_corners=max_corners)
     assert len(found.outer) <= max_corners
     assert found.holes == ()
 
@@ -225,7 +208,7 @@ def test_holes_do_not_cost_corners(seed: int, max_corners: int, tolerance: float
     cells = np.kron(random.random((6, 5)) < 0.8, np.ones((8, 8), np.bool_))
     objects = random.random(cells.shape) < density
     cells &= ~objects
-    found = outline_of(cells, (48.0, 20.0), objects, objects, tolerance=tolerance, max_corners=max_corners)
+    found = outlines.outline_of(cells, (48.0, 20.0), objects, objects, tolerance=tolerance, max_corners=max_corners)
     assert len(found.outer) <= max_corners
     polygon = polygon_of(found)
     assert polygon.is_valid
@@ -235,9 +218,9 @@ def test_holes_do_not_cost_corners(seed: int, max_corners: int, tolerance: float
 
 @given(streets(12))
 def test_without_a_tolerance_the_cells_are_outlined(cells: NDArray[np.bool_]) -> None:
-    resolve_contacts(cells, np.zeros_like(cells))
-    found = outline_of(cells, (6.0, 6.0), ~cells, ~cells, tolerance=0.0, max_corners=4)
-    part = nearest_part(cells, (6.0, 6.0))
+    outlines.resolve_contacts(cells, np.zeros_like(cells))
+    found = outlines.outline_of(cells, (6.0, 6.0), ~cells, ~cells, tolerance=0.0, max_corners=4)
+    part = outlines.nearest_part(cells, (6.0, 6.0))
     assert shape_of(part).symmetric_difference(polygon_of(found)).area == 0.0
 
 
@@ -248,28 +231,30 @@ def test_results_by_hand() -> None:
     cells[15:18, 20:27] = False  # a gap
     obstacle = np.zeros_like(cells)
     obstacle[9, 11] = True
-    found = outline_of(cells, (20.0, 15.0), np.zeros_like(cells), obstacle, tolerance=2.0, max_corners=40)
+    found = outlines.outline_of(cells, (20.0, 15.0), np.zeros_like(cells), obstacle, tolerance=2.0, max_corners=40)
     assert found.factor == 1.0
     assert len(found.outer) == 4
     (hole,) = found.holes
     assert box(8, 10, 10, 12).within(Polygon(hole))
     assert box(6, 8, 12, 14).contains(Polygon(hole))
-    exact = outline_of(cells, (20.0, 15.0), ~cells, ~cells, tolerance=0.0, max_corners=4)
+    exact = outlines.outline_of(cells, (20.0, 15.0), ~cells, ~cells, tolerance=0.0, max_corners=4)
     assert len(exact.outer) == 62
     assert len(exact.holes) == 2
 
 
 def test_a_ring_of_one_cell_stays_a_ring() -> None:
-    (ring,) = rings_of(np.pad([[True]], 1))
+    (ring,) = outlines.rings_of(np.pad([[True]], 1))
     assert ring.tolist() == [[2, 2], [1, 2], [1, 1], [2, 1]]
     cell = np.ones((1, 1), np.bool_)
-    found = outline_of(cell, (0.0, 0.0), ~cell, ~cell, tolerance=5.0, max_corners=4)
+    found = outlines.outline_of(cell, (0.0, 0.0), ~cell, ~cell, tolerance=5.0, max_corners=4)
     assert len(found.outer) in (3, 4)
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_arrays_of_any_order(order: str) -> None:
     cells = np.asarray(np.random.default_rng(0).random((12, 9)) < 0.8, order=order)  # type: ignore[call-overload]
-    expected = outline_of(np.ascontiguousarray(cells), (3.0, 3.0), ~cells, ~cells, tolerance=1.0, max_corners=9)
-    found = outline_of(cells, (3.0, 3.0), ~cells, ~cells, tolerance=1.0, max_corners=9)
+    expected = outlines.outline_of(
+        np.ascontiguousarray(cells), (3.0, 3.0), ~cells, ~cells, tolerance=1.0, max_corners=9
+    )
+    found = outlines.outline_of(cells, (3.0, 3.0), ~cells, ~cells, tolerance=1.0, max_corners=9)
     np.testing.assert_array_equal(found.outer, expected.outer)

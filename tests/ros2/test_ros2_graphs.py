@@ -25,7 +25,7 @@ pytest.importorskip("rosbags")
 from ros2_helpers import MESSAGES, Perceive, cloud, odometry, scans
 
 from cli_helpers import Shell
-from edgeperc import MissingExtraError, OptionError, Perceiver, SensorError, Tracker
+from edgeperc import OptionError, Perceiver, SensorError, Tracker
 from edgeperc.cli.main import main
 from edgeperc.records import PerceivedScan
 from edgeperc.road.grid import split_points
@@ -181,12 +181,6 @@ def test_what_is_no_graph(
         monkeypatch.setenv(name, value)
     with pytest.raises(OptionError, match=said):
         ZenohGraph(**options)
-
-
-def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(MissingExtraError, match=r"edgeperc\[ros2\]"):
-        ZenohGraph()
 
 
 def test_the_command_of_the_page_answers_another_process(router: str, watch: Watch, tmp_path: Path) -> None:

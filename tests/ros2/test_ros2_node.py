@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -303,11 +304,7 @@ def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:
 
 def test_what_no_cloud_heals_is_raised() -> None:
     graph = FakeGraph()
-
-    def fails(_: Mapping[str, Any]) -> Any:
-        raise ModelFileError("no such model")
-
-    with PerceptionNode(graph, fails) as node:
+    with PerceptionNode(graph, Mock(side_effect=ModelFileError("no such model"))) as node:
         graph.give(cloud(POINTS))
         with pytest.raises(ModelFileError):
             next(iter(node))

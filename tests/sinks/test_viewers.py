@@ -8,7 +8,6 @@ import math
 import os
 import socket
 import struct
-import sys
 import threading
 import time
 import zipfile
@@ -27,9 +26,9 @@ from hypothesis import strategies as st
 from test_pages import HOSTILE, opened, perceived
 from test_pictures import CAR, VAN, a_perception, a_scan, scene_of, unpacked
 
-from cli_helpers import thinned
-from edgeperc import Mounting, Tracker, cli, read_scans
-from edgeperc.errors import MissingExtraError, OptionError, PointsError
+from cli_helpers import Shell, thinned
+from edgeperc import Mounting, Tracker, read_scans
+from edgeperc.errors import OptionError, PointsError
 from edgeperc.records import PerceivedScan, Sink
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence
@@ -770,7 +769,7 @@ def test_a_page_of_one_scan_has_no_play_bar(browser: Any, tmp_path: Path) -> Non
     page.close()
 
 
-def test_a_drive_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drive_on_the_command_line(tmp_path: Path, shell: Shell) -> None:
     pytest.importorskip("foxglove")
     drive = tmp_path / "drive"
     drive.mkdir()
@@ -781,8 +780,7 @@ def test_a_drive_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         scan.points.tofile(drive / f"{k}.bin")
         counts.append(len(scan.points))
     options = ["--track", "--json", "--mcap", str(tmp_path / "run.mcap"), "--play", str(tmp_path / "run.html")]
-    assert cli.main(["run", str(drive), *options, "--serve", "127.0.0.1:0"]) == 0
-    printed = capsys.readouterr()
+    printed = shell.both("run", drive, *options, "--serve", "127.0.0.1:0")
     assert "open ws://127.0.0.1:" in printed.err
     records = [json.loads(line) for line in printed.out.splitlines()]
     topics = read_mcap(tmp_path / "run.mcap")
@@ -794,22 +792,9 @@ def test_a_drive_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("value", ["drive/", "localhost", "host:port", ":70000", "1.2.3.4:-1"])
-def test_addresses_are_checked(value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_addresses_are_checked(value: str, tmp_path: Path, shell: Shell) -> None:
     (tmp_path / "0.bin").write_bytes(bytes(16))
-    with pytest.raises(SystemExit):
-        cli.main(["run", str(tmp_path / "0.bin"), "--serve", value])
-    assert "expected HOST:PORT" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("module", ["foxglove", "rerun"])
-def test_missing_extras_are_named(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [module, *(name for name in sys.modules if name.startswith(f"{module}."))]:
-        monkeypatch.setitem(sys.modules, name, None)
-    makers = {"foxglove": (lambda: McapSink(tmp_path / "a"), ServeSink), "rerun": (lambda: RerunSink(tmp_path / "a"),)}
-    for make in makers[module]:
-        with pytest.raises(MissingExtraError, match=rf"edgeperc\[{module}\]"):
-            make()
-    assert not [*tmp_path.iterdir()]
+    assert "expected HOST:PORT" in shell.err("run", tmp_path / "0.bin", "--serve", value)
 
 
 def test_colors_and_times() -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numba
 import pytest
@@ -85,10 +86,7 @@ def test_few_kernels_are_not_worth_a_line(kernels: list[Any], n_missing: int, ca
 
 
 def test_nothing_is_counted_while_nothing_is_compiled(kernels: list[Any]) -> None:
-    def counted() -> list[Any]:
-        raise AssertionError
-
-    with Compilation(counted):
+    with Compilation(Mock(side_effect=AssertionError)):
         pass
     assert lines() == [""]
 

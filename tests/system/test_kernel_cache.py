@@ -18,6 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from types import FunctionType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import llvmlite
 import numba
@@ -164,12 +165,8 @@ def test_damaged_files_are_reported_once_and_compiled_again(place: Place, damage
 
 def test_contents_that_cannot_be_loaded_are_compiled_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such as those of a numba that was changed without another version number."""
-
-    def refuse(*_: object) -> None:
-        raise AttributeError("no such function")
-
     with monkeypatch.context() as patch:
-        patch.setattr(kernel_cache.pickle, "loads", refuse)
+        patch.setattr(kernel_cache.pickle, "loads", Mock(side_effect=AttributeError("no such function")))
         (warning,), n_compiled = place.start()
     assert "AttributeError: no such function" in warning
     assert n_compiled == 2
@@ -321,10 +318,7 @@ def test_folder_of_another_user_is_not_used(place: Place, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
 def test_disk_that_takes_nothing_is_reported(empty: Place, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(kernel_cache, "write_atomic", refuse)
+    monkeypatch.setattr(kernel_cache, "write_atomic", Mock(side_effect=OSError(code, os.strerror(code))))
     (warning,), n_compiled = empty.start()
     assert n_compiled == 2
     assert os.strerror(code) in warning
@@ -400,14 +394,10 @@ def test_read_only_package_and_home_are_reported(without_setting: Place, tmp_pat
 
 def test_no_home(without_setting: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     (without_setting.source.parent / "__pycache__").write_bytes(b"")
-
-    def missing() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
     monkeypatch.delenv("EDGEPERC_CACHE_DIR")
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(Path, "home", missing)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError("Could not determine home directory.")))
     (warning,), n_compiled = without_setting.start()
     assert n_compiled == 2
     assert "compiled kernels are not kept" in warning

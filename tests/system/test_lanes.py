@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -77,11 +78,7 @@ def test_an_error_gives_the_cores_back(cores: set[int]) -> None:
 def test_an_error_is_told_where_it_happened(n: int) -> None:
     """Not by each of the values that need the one that failed; and what comes after it is not computed."""
     value, computed = Values(Stopwatch()), []
-
-    def fail() -> None:
-        raise ValueError("no")
-
-    last = value("check", fail)
+    last = value("check", Mock(side_effect=ValueError("no")))
     for k in range(30):
         last = value("check", lambda k, _: computed.append(k), k, last)
     with pytest.raises(ValueError, match="no") as raised:
@@ -184,10 +181,7 @@ def test_a_caller_on_one_core_stays_there(cores: set[int]) -> None:
 
 
 def test_cores_that_may_not_be_chosen(monkeypatch: pytest.MonkeyPatch, cores: set[int]) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError("sandbox")
-
-    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    monkeypatch.setattr(os, "sched_setaffinity", Mock(side_effect=PermissionError("sandbox")))
     assert met(lambda: 1, lambda: 2) == (1, 2)
     monkeypatch.delattr(os, "sched_setaffinity")
     assert met(lambda: 1, lambda: 2) == (1, 2)

@@ -8,6 +8,7 @@ import os
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -218,12 +219,9 @@ def test_a_start_survives_strange_settings(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no passwd")
 def test_no_home_is_a_typed_error(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    def missing() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
     for name in ("EDGEPERC_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(Path, "home", missing)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError("Could not determine home directory.")))
     with pytest.raises(SettingsError, match="no home folder; set EDGEPERC_CACHE_DIR"):
         machine.settings_path()
     assert machine.compiled_folder("a", "f" * 64, "fp32") is None

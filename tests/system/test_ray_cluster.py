@@ -18,7 +18,7 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from cli_helpers import write_scan
+from cli_helpers import Shell, write_scan
 from edgeperc import cli
 from edgeperc.cli import side_by_side
 from edgeperc.cli.main import build_parser
@@ -209,22 +209,11 @@ def test_a_perceiver_starts_from_what_another_learned(scans: Path) -> None:
 
 @pytest.mark.parametrize("option", ["--track", "--live", "--static=out"])
 @pytest.mark.parametrize("asked", ["--engine ray", "--workers 2"])
-def test_what_needs_an_order_is_refused(
-    scans: Path, tmp_path: Path, option: str, asked: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["run", str(scans), *asked.split(), option])
-    assert f"in their order, and {asked} perceives" in capsys.readouterr().err
-    (tmp_path / "drive.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
-    with pytest.raises(SystemExit):
-        cli.main(["run", str(tmp_path / "drive.pcap"), *asked.split(), "--model", "pointseg"])
-    assert f"{asked} takes scan files" in capsys.readouterr().err
-
-
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"edgeperc\[ray\]"):
-        list(map_on_ray(int, (), [1]))
+def test_what_needs_an_order_is_refused(scans: Path, tmp_path: Path, option: str, asked: str, shell: Shell) -> None:
+    assert f"in their order, and {asked} perceives" in shell.err("run", scans, *asked.split(), option)
+    drive = tmp_path / "drive.pcap"
+    drive.write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
+    assert f"{asked} takes scan files" in shell.err("run", drive, *asked.split(), "--model", "pointseg")
 
 
 def test_paths_stay_paths(tmp_path: Path) -> None:
@@ -395,7 +384,5 @@ def test_the_package_of_a_protocol_is_named(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("arguments", [["--gif", "--track", "--out", "s3://b/out"], ["--live"]])
-def test_what_urls_cannot_do(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["run", "s3://bucket/scans", *arguments])
-    assert "takes no URL" in capsys.readouterr().err
+def test_what_urls_cannot_do(arguments: list[str], shell: Shell) -> None:
+    assert "takes no URL" in shell.err("run", "s3://bucket/scans", *arguments)
