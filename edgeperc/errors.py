@@ -2,28 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "CalibrationError",
-    "CardError",
-    "CardMismatchError",
-    "EdgepercError",
-    "FitnessError",
-    "ImageError",
-    "InferenceError",
-    "MissingExtraError",
-    "ModelError",
-    "ModelFileError",
-    "MountingError",
-    "OptionError",
-    "PointsError",
-    "ProviderError",
-    "SensorError",
-    "SettingsError",
-    "SplitError",
-    "StampError",
-    "TrackingError",
-]
-
 
 class EdgepercError(Exception):
     """Base class of all errors of edgeperc."""

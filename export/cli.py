@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(given: list[str]) -> int:
     args = build_parser().parse_args(given)
     try:
-        return int(args.run(args))
+        return int(args.run(args) or 0)
     except ModuleNotFoundError as exc:
         raise MissingExtraError(exc.name or "a package", args.extra, "edgeperc-export") from exc
     except (EdgepercError, FloatingPointError, ValueError) as exc:
@@ -84,7 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(
-        name: str, help: str, run: Callable[[argparse.Namespace], int], **defaults: Any
+        name: str, help: str, run: Callable[[argparse.Namespace], int | None], **defaults: Any
     ) -> argparse.ArgumentParser:
         made: argparse.ArgumentParser = commands.add_parser(name, help=help)
         made.set_defaults(run=run, **defaults)
@@ -183,12 +183,11 @@ def _add_simulate(command: Command) -> None:
     add("--workers WORKERS", "number of processes that simulate (default: this one)", type=count, default=0)
 
 
-def _simulate(args: argparse.Namespace) -> int:
+def _simulate(args: argparse.Namespace) -> None:
     from .data.simulate import simulate
 
     how = keywords(args, "first", "sensor", "where", layouts_root="layouts", n_workers="workers")
     simulate(args.out, args.n, **how)
-    return 0
 
 
 def _add_train(command: Command) -> None:
@@ -229,7 +228,7 @@ def _add_train(command: Command) -> None:
     _add_recipe_options(train)
 
 
-def _train(args: argparse.Namespace) -> int:
+def _train(args: argparse.Namespace) -> None:
     recipe = recipe_of(args)
     from edgeperc.datasets.scan_folder import ScanFolder
 
@@ -241,7 +240,6 @@ def _train(args: argparse.Namespace) -> int:
         args.start_from, args.teacher, args.threads, args.workers, args.compile, args.checkpoint_every, args.tensorboard
     )
     print_line(str(train(recipe, args.out, data, run)))
-    return 0
 
 
 def _add_curve(command: Command) -> None:
@@ -250,13 +248,12 @@ def _add_curve(command: Command) -> None:
     add("--lines LINES", "at most this many lines for each run (default 12)", type=positive, default=12)
 
 
-def _curve(args: argparse.Namespace) -> int:
+def _curve(args: argparse.Namespace) -> None:
     from .training.log import curve_table
 
     for run in args.runs:
         for line in curve_table(run, args.lines):
             print_line(line)
-    return 0
 
 
 def _add_export(command: Command) -> None:
@@ -280,7 +277,7 @@ def _add_export(command: Command) -> None:
     )
 
 
-def _export(args: argparse.Namespace) -> int:
+def _export(args: argparse.Namespace) -> None:
     from .data.simulate import fitness_of, parity_samples
     from .release.to_onnx import export
     from .training.checkpoint import read_checkpoint
@@ -297,7 +294,6 @@ def _export(args: argparse.Namespace) -> int:
         **keywords(args, "name", "licence", version="model_version"),
     )
     print_line(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
-    return 0
 
 
 def _add_verify(command: Command) -> None:
@@ -307,13 +303,12 @@ def _add_verify(command: Command) -> None:
     add("--scans SCANS", PROOF, type=Path, nargs="*", default=[])
 
 
-def _verify(args: argparse.Namespace) -> int:
+def _verify(args: argparse.Namespace) -> None:
     from .data.simulate import parity_samples
     from .release.to_onnx import load, verify
 
     network, recipe, _ = load(args.checkpoint)
     print_line(json.dumps(verify(network, args.model, parity_samples(recipe.task, args.scans))))
-    return 0
 
 
 def _add_card(command: Command) -> None:
@@ -330,7 +325,7 @@ def _json_text(path: Path) -> str:
     return content.decode(json.detect_encoding(content))
 
 
-def _card(args: argparse.Namespace) -> int:
+def _card(args: argparse.Namespace) -> None:
     import onnx
     from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
@@ -354,7 +349,6 @@ def _card(args: argparse.Namespace) -> int:
     card = with_golden(model, card)
     write_card(model, card, args.out)
     print_line(f"{args.out}: {card.name} {card.version}")
-    return 0
 
 
 def _add_quantize(command: Command) -> None:
@@ -382,7 +376,7 @@ def _add_quantize(command: Command) -> None:
     add("--threads THREADS", "number of CPU threads for timing (default: onnxruntime's choice)", type=positive)
 
 
-def _quantize(args: argparse.Namespace) -> int:
+def _quantize(args: argparse.Namespace) -> None:
     from edgeperc.datasets.scan_folder import ScanFolder
     from edgeperc.preprocess.fitness import FitnessProfile
     from edgeperc.types.card import ModelCard
@@ -412,7 +406,7 @@ def _quantize(args: argparse.Namespace) -> int:
 
         card = quantize_objects(args.model, args.out, calibration, kitti=args.kitti, **how)
         print_line(f"{args.out}: {card.name} {card.version}: {card.parity['speed']}")
-        return 0
+        return
     labeled = LabeledSets(args.kitti, args.semantickitti, args.camvid, args.evaluate_on)
     card = quantize(args.model, args.out, calibration, labeled, exclude=args.exclude, **how)
     print_line(
@@ -422,7 +416,6 @@ def _quantize(args: argparse.Namespace) -> int:
     print_line(
         f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}"
     )
-    return 0
 
 
 def _add_agree(command: Command) -> None:
@@ -436,7 +429,7 @@ def _add_agree(command: Command) -> None:
     add("--scans N", "at most N scans of each set (default: all)", type=positive)
 
 
-def _agree(args: argparse.Namespace) -> int:
+def _agree(args: argparse.Namespace) -> None:
     from .release.agree import agree, summary
 
     how = keywords(args, "kitti", "semantickitti", "camvid", "split", n_scans="scans")
@@ -445,7 +438,6 @@ def _agree(args: argparse.Namespace) -> int:
         print_line(line)
     if "bf16" not in measured:
         print_line("bf16 was not measured; it needs a processor with bf16 and openvino: pip install 'edgeperc[peers]'")
-    return 0
 
 
 def _add_make(command: Command) -> None:
@@ -460,7 +452,7 @@ def _add_make(command: Command) -> None:
     _add_shared(add, "--threads THREADS", "--workers WORKERS", "--compile", "--model-version MODEL_VERSION")
 
 
-def _make(args: argparse.Namespace) -> int:
+def _make(args: argparse.Namespace) -> None:
     from edgeperc.datasets.scan_folder import ScanFolder
 
     from .make import make
@@ -475,7 +467,6 @@ def _make(args: argparse.Namespace) -> int:
         **keywords(args, "layouts", "semantickitti", "steps", version="model_version"),
     )
     print_line(str(path))
-    return 0
 
 
 def _add_ablate(command: Command) -> None:
@@ -511,9 +502,10 @@ def _add_ablate(command: Command) -> None:
     _add_shared(add, "--threads THREADS")
 
 
-def _ablate(args: argparse.Namespace) -> int:
+def _ablate(args: argparse.Namespace) -> None:
     if args.network == "camvid":
-        return _ablate_camvid(args)
+        _ablate_camvid(args)
+        return
     from .training.ablation import ablate, plot
     from .training.train import Data, Run
 
@@ -533,7 +525,6 @@ def _ablate(args: argparse.Namespace) -> int:
         print_line(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
     if args.plot is not None:
         plot(rows, args.plot)
-    return 0
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -543,7 +534,7 @@ def _size(text: str) -> tuple[int, int]:
     return positive(width), positive(height)
 
 
-def _ablate_camvid(args: argparse.Namespace) -> int:
+def _ablate_camvid(args: argparse.Namespace) -> None:
     from .training.camvid import ablate_camvid, plot_camvid, show_camvid, table
 
     if args.camvid is None:
@@ -558,7 +549,6 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
         plot_camvid(rows, args.out)
         show_camvid(args.out / "camvid.npz", args.out / "predictions.png")
         show_camvid(args.out / "camvid.npz", args.out / "segmentations.png", args.camvid)
-    return 0
 
 
 def _add_triton(command: Command) -> None:
@@ -572,14 +562,13 @@ def _add_triton(command: Command) -> None:
     add("--sensor SENSOR", "sensor of the scans (default hdl-64e)", default="hdl-64e")
 
 
-def _triton(args: argparse.Namespace) -> int:
+def _triton(args: argparse.Namespace) -> None:
     from edgeperc.zoo import DEFAULT
 
     from .release.triton import write_repository
 
     for folder in write_repository(args.out, args.model or DEFAULT, sensor=args.sensor):
         print_line(str(folder))
-    return 0
 
 
 def _add_models(command: Command) -> None:
@@ -587,12 +576,11 @@ def _add_models(command: Command) -> None:
     add("folder", "folder of .onnx models", type=Path)
 
 
-def _models(args: argparse.Namespace) -> int:
+def _models(args: argparse.Namespace) -> None:
     from .release.models_page import models_page, sums_of
 
     (args.folder / "MODELS.md").write_text(models_page(args.folder))
     (args.folder / "SHA256SUMS").write_text(sums_of(args.folder))
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """What hypothesis draws for more than one file of tests."""
 
-from __future__ import annotations
-
 from hypothesis import strategies as st
 
 JSON = st.recursive(

@@ -7,7 +7,3 @@ counts labels and matches boxes. `unseen` raises an error for scans that a model
 describes the errors of a scan for a picture. `camvid` evaluates camera models on labeled images. `transfer` evaluates a
 model on other sensors. `tracking` evaluates the tracker on KITTI's sequences, by `tracking_metrics`.
 """
-
-from __future__ import annotations
-
-__all__: list[str] = []

@@ -15,8 +15,6 @@ from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.points import Floats, Ints, Points, read_only
 from .planes import CELL_M, N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
-__all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
-
 # What differs from the training vehicle by less, or by less than two standard deviations, is taken for the street's own
 # slope and camber: scans stay as they are. An error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one
 # and three points of IoU of cars.
@@ -174,8 +172,7 @@ class MountingEstimator:
     def contradicted_by(self, points: Points) -> Mounting | None:
         """The mounting by the ground in a scan, if the given roll or pitch is another; None if not, or unsure."""
         given = _values(self.known)[1:3]
-        usual = _filled(self.known, _values(MODEL_MOUNTING))
-        start = replace(usual, yaw_deg=self.known.yaw_deg or 0.0)
+        start = replace(_filled(self.known, _values(MODEL_MOUNTING)), yaw_deg=self.known.yaw_deg or 0.0)
         level = replace(start, roll_deg=180.0 * round((start.roll_deg or 0.0) / 180.0), pitch_deg=0.0)
         for guess in (start, level):  # the ground is found from up to 16 degrees off
             try:

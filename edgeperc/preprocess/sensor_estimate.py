@@ -23,8 +23,6 @@ from ..types.sensor import SAY_PATTERN, SENSORS, SensorProfile
 from .findings import BEYOND, FEET_PER_M, check_coordinates, in_feet
 from .returns import with_remission
 
-__all__ = ["MOST_SCANS", "SensorEstimate", "compile_votes", "estimate_sensor", "fill_votes", "has_enough_points"]
-
 MOST_SCANS = 3  # that an estimate uses
 
 FEWEST_POINTS = 2000

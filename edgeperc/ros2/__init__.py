@@ -3,7 +3,3 @@
 `messages` turns answers into messages and CDR bytes, `graph` says what a node needs of its middleware, `zenoh_graph`
 and `rclpy_graph` are the two middlewares, and `node` perceives the newest cloud of a topic.
 """
-
-from __future__ import annotations
-
-__all__: list[str] = []

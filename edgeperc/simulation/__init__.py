@@ -6,8 +6,6 @@
 training and evaluation, with point labels from boxes as in KITTI.
 """
 
-from __future__ import annotations
-
 from .drawn import ENVIRONMENTS, random_scene
 from .layouts import scene_from_boxes
 from .scene import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SceneObject, SimulatedScan, simulate, simulate_sequence

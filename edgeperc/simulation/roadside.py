@@ -67,8 +67,7 @@ def _sign(rng: np.random.Generator) -> tuple[list[Row], float]:
     radius, low = rng.uniform(0.025, 0.045), rng.uniform(1.7, 2.5)
     if rng.random() < 0.2:  # low, as on islands and at road works
         low = rng.uniform(0.5, 1.2)
-    rows = _board(rng, low)
-    return [post(0.3, 0.0, 0.0, low + 0.7, radius), *rows], 0.1
+    return [post(0.3, 0.0, 0.0, low + 0.7, radius), *_board(rng, low)], 0.1
 
 
 def _wide_sign(rng: np.random.Generator) -> tuple[list[Row], float]:

@@ -3,8 +3,6 @@
 A sink imports its optional package when it is made, so that a missing extra is reported before the first scan.
 """
 
-from __future__ import annotations
-
 from ..records import PerceivedScan, Sink
 
 __all__ = ["PerceivedScan", "Sink"]

@@ -96,8 +96,7 @@ def map_in_processes(
                     pool.remove(process)
                     todo.extendleft(reversed(process.numbers))
                     if process.died_of(deaths) >= MOST_DEATHS:
-                        number = todo.popleft()
-                        results[number] = Lost(DIED)
+                        results[todo.popleft()] = Lost(DIED)
                     continue
                 if answer is not None:
                     results[answer[0]] = answer[1]

@@ -6,8 +6,6 @@ sensor's motion if no poses are passed. `tracks` holds the results and the param
 `edgeperc.evaluation.tracking` evaluates the tracks.
 """
 
-from __future__ import annotations
-
 from .tracker import Tracker
 from .tracks import ClassParameters, Track, Tracks
 

@@ -1,7 +1,5 @@
 """Names that options take, and their defaults. This module imports nothing, so that ``--help`` is fast."""
 
-from __future__ import annotations
-
 DEFAULT_MODELS = ("ssadnet", "pointseg", "objects")
 OPEN_MODELS = ("ssadnet-open", "sceneseg", "objects-open")
 WEIGHTS = {"default": DEFAULT_MODELS, "open": OPEN_MODELS}

@@ -4,8 +4,6 @@ The functions that draw need the extra ``view``; the others need numpy alone. Al
 existing file atomically. Pictures are also returned as bytes; their ``path`` is optional.
 """
 
-from __future__ import annotations
-
 from .files import write_labels, write_ply
 from .page import DrivePage, write_html
 from .painted import draw_painted

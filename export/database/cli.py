@@ -102,7 +102,7 @@ def _build(args: argparse.Namespace) -> int:
     return 1 if report.skipped else 0
 
 
-def _label(args: argparse.Namespace) -> int:
+def _label(args: argparse.Namespace) -> None:
     from .label_page import LabelServer
 
     polygons = args.polygons or args.out / "road.coco.json"
@@ -112,10 +112,9 @@ def _label(args: argparse.Namespace) -> int:
             webbrowser.open(server.url)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
-    return 0
 
 
-def _coco(args: argparse.Namespace) -> int:
+def _coco(args: argparse.Namespace) -> None:
     from edgeperc.system.atomic import open_atomic
 
     from .coco import write_database_coco
@@ -124,7 +123,6 @@ def _coco(args: argparse.Namespace) -> int:
     with open_atomic(args.file, "w") as file:
         n = write_database_coco(TopViewDatabase(args.out), file)
     print_line(f"{args.file}: {n} annotations")
-    return 0
 
 
 def _check(args: argparse.Namespace) -> int:
