@@ -96,7 +96,6 @@ class PillarNet(nn.Module):
 
 def inputs_of(card: ModelCard, points: NDArray[np.float32]) -> tuple[Tensor, ...]:
     """The pillars of a scan in the frame of the network, as tensors."""
-    assert isinstance(card.view, PillarGeometry)
     maker = Pillarizer(card.view, card.input)
     n = maker.fill(points)
     return tuple(torch.from_numpy(each[:n].copy()) for each in maker.pillars)

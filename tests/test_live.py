@@ -20,8 +20,6 @@ from edgeperc.errors import InferenceError, OptionError, PointsError, StampError
 from edgeperc.live import stream
 from waiting import TIMEOUT_S, until
 
-# Nothing here takes long; a test that waits this long has failed.
-
 
 def scan(k: int) -> np.ndarray:
     return np.full((k, 4), k, np.float32)

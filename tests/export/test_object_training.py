@@ -249,7 +249,6 @@ def test_a_step_lowers_the_loss(samples: ObjectSamples) -> None:
 def test_the_graph_looks_closely_where_the_first_look_says_so(tmp_path: Path) -> None:
     """None, some and all of the candidates: torch and onnxruntime agree."""
     network = build(RECIPE).eval()
-    assert isinstance(network, ObjectNet)
     card, path = Objects.of(RECIPE).card, tmp_path / "objects.onnx"
     with torch.no_grad():
         network.look.head2.bias.fill_(-3.5)

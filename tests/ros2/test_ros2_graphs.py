@@ -403,7 +403,6 @@ def test_the_node_by_rclpy(bus: Bus) -> None:
     with node:
         bus.subscriptions["/points"][0](cloud(POINTS))
         scan = next(iter(node))
-        assert isinstance(scan, PerceivedScan)
         MESSAGES.frame_id = "velodyne"
         assert answers == [MESSAGES.encode(MESSAGES.points(scan, 10**9))]
     assert bus.ended == ["/front/top"]
@@ -507,7 +506,6 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, made: list[Any]) -> None
     ((_, options),) = made
     assert (options["outputs"], options["lifecycle"]) == (["rolling=/grid", "ground_points"], True)
     rolling = options["rolling"]
-    assert isinstance(rolling, Rolling)
     assert (rolling.topic, rolling.sensor_pose) == ("/odometry/filtered", [1.0, 0.0, 1.5, 0.0, 0.0, 90.0])
     assert rolling.grid.values().shape == (100, 100)
 
