@@ -87,13 +87,6 @@ def run(*arguments: object) -> int:
     return cli.main([str(a) for a in arguments])
 
 
-def usage_code(*arguments: object) -> int:
-    """The exit code of a command line that is not run."""
-    with pytest.raises(SystemExit) as left:
-        run(*arguments)
-    return left.value.code
-
-
 class Shell:
     """Command lines of a program: each ends with the code that is expected, and gives what was printed."""
 

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cli_helpers import POINTSEG, run, thinned, usage_code
+from cli_helpers import POINTSEG, Shell, run, thinned
 from edgeperc import Box, CalibrationError, ImageLabels, OptionError, Perception, PointsError, Tracker, Tracks
 from edgeperc.camera.calibration import read_kitti_calibration
 from edgeperc.datasets.annotations import read_labelcloud, read_sustechpoints
@@ -402,7 +402,7 @@ class Seeing:
         return Perception(len(points), 0, None, None, BOXES, {}, {}, (), stamp_s)
 
 
-def test_the_command_writes_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
     monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Seeing))
     (tmp_path / "drive").mkdir()
     for k in range(3):
@@ -418,7 +418,7 @@ def test_the_command_writes_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run("run", tmp_path / "drive", "--labels-for", "kitti", "--calib", calib, "--out", tmp_path / "k") == 0
     assert (tmp_path / "k/calib/000002.txt").read_text() == CALIBRATION
     for out in ([], ["--out", "s3://bucket/labels"]):
-        assert usage_code("run", tmp_path / "drive", "--labels-for", "kitti", *out) == 2
+        assert shell.err("run", tmp_path / "drive", "--labels-for", "kitti", *out)
 
 
 @pytest.mark.filterwarnings("default:no scan to train on has a label of pedestrian, cyclist")

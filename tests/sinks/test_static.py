@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cli_helpers import POINTSEG, run, usage_code
+from cli_helpers import POINTSEG, Shell, run
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.sinks import Sinks
@@ -154,7 +154,7 @@ class Standing:
         return Perception(len(points), 1, None, None, (AHEAD, *parked), {}, {}, (), stamp_s)
 
 
-def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
     monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Standing))
     (tmp_path / "drive").mkdir()
     for k in range(12):
@@ -169,12 +169,12 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
     assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "drive") == 1
     assert (tmp_path / "drive/000003.bin").read_bytes() == POINTS.tobytes()
     for wrong in (["--static", tmp_path / "out"], ["--movable"]):
-        assert usage_code("run", tmp_path / "drive", *wrong) == 2
+        assert shell.err("run", tmp_path / "drive", *wrong)
 
 
 @pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap"), ("000001.csv", "a")])
 def test_no_scan_is_replaced_by_another_one(
-    paths: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    paths: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Standing))
     for folder in "ab":
@@ -182,8 +182,8 @@ def test_no_scan_is_replaced_by_another_one(
         POINTS.tofile(tmp_path / folder / "000001.bin")
     (tmp_path / "drive.pcap").write_bytes(bytes(24))
     (tmp_path / "000001.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")  # becomes 000001.bin
-    assert usage_code("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a") == 2
-    assert "would be overwritten by --static with another one" in capsys.readouterr().err
+    said = shell.err("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
+    assert "would be overwritten by --static with another one" in said
     assert (tmp_path / "a/000001.bin").read_bytes() == POINTS.tobytes()
 
 
