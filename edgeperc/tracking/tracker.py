@@ -352,9 +352,8 @@ class Tracker:
         own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (detections.logits >= classes["birth_logit"]))
         if not len(own):
             return tracks
-        joined = np.zeros(
-            len(tracks) + len(own), lives.TRACK
-        )  # np.concatenate takes ten times as long with named fields
+        # np.concatenate takes ten times as long with named fields.
+        joined = np.zeros(len(tracks) + len(own), lives.TRACK)
         joined[: len(tracks)] = tracks
         born = Detections._make(field[own] for field in detections)
         lives.fill_newborn(self._next_id, born, classes[own], joined[len(tracks) :])
