@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
 from edgeperc.types.choices import VEHICLES
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box, Perception
 from edgeperc.types.points import Labels, Points
 from edgeperc.types.sensor import SensorProfile, get_sensor
@@ -100,10 +100,8 @@ def _rounded(value: float) -> float | None:
 
 def profile_of(name: str) -> SensorProfile:
     """A sensor; "-hanging": as it sees the street upside down."""
-    profile = get_sensor(name.removesuffix("-hanging"))
-    if name.endswith("-hanging"):
-        profile = replace(profile, elevations_deg=tuple(-deg for deg in reversed(profile.elevations_deg)))
-    return profile
+    roll_deg = 180.0 if name.endswith("-hanging") else 0.0
+    return get_sensor(name.removesuffix("-hanging")).upright(Mounting(roll_deg=roll_deg))
 
 
 class NearFigures:

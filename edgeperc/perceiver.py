@@ -292,7 +292,7 @@ class Perceiver:
         agreement = points and bool(self.agree)
         detections = any(card.box_classes for card in scans if card.view.kind == "top_view")
         gaps = self._interpolates and any(
-            self._finds_sensor or Interpolator(card.view, self.sensor).needed
+            self._finds_sensor or Interpolator(card.view, self.sensor.upright(self._estimator.known)).needed
             for card in scans
             if isinstance(card.view, RangeImageGeometry)
         )
@@ -370,6 +370,7 @@ class Perceiver:
 
     def _assemble(self, sensor: SensorProfile) -> Pipeline | None:
         """The pipeline of the LiDAR networks; None without any."""
+        sensor = sensor.upright(self._estimator.known)
         top: TopViewNetwork | None = None
         ranged: list[RangeImageNetwork] = []
         objects: ObjectNetwork | None = None
@@ -611,13 +612,14 @@ class Perceiver:
         if check and (roll_deg, before.known.pitch_deg) != (None, None):
             hidden = (*hidden, self._about_given_tilt(before.contradicted_by(scan)))
             watch.lap("check")
+        upright = profile.upright(before.known)
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
         fitness = findings.check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
             ceiling_m = find_ceiling(scan, float(self._frame.eye[2]))
-            fitness = turned or findings.check_profiles(scan, self._fitness, profile, self._frame, ceiling_m)
+            fitness = turned or findings.check_profiles(scan, self._fitness, upright, self._frame, ceiling_m)
             fitness = findings.with_raw_remission(fitness, given, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *filter(None, hidden))
@@ -631,7 +633,7 @@ class Perceiver:
                 self._remission = matcher
                 self._sensor_estimate = None
                 raise
-        scan, health, parts = self._without_drops(scan, profile, watch)
+        scan, health, parts = self._without_drops(scan, upright, watch)
         return Perception(
             n_points=len(scan),
             n_dropped=dropped.total,

@@ -768,6 +768,19 @@ def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) ->
     assert finds.sensor.name == other
 
 
+def test_a_sensor_that_hangs_sees_what_one_with_its_beams_turned_over_sees() -> None:
+    hung = replace(MODEL_MOUNTING, roll_deg=180.0)
+    sensor = replace(get_sensor("hdl-32e"), remission_range=(0.0, 1.0), mounting=hung)
+    turned = replace(sensor.upright(hung), mounting=MODEL_MOUNTING)
+    scan = urban(8, turned).points
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
+    level, hanging = (Perceiver("ssadnet", sensor=each, **options) for each in (turned, sensor))
+    answers = level(scan), hanging(scan * np.float32([1, -1, -1, 1]))
+    cells, findings = zip(*((a.require_top_view().drivable, a.health.findings) for a in answers), strict=True)
+    assert findings == ((), ())
+    assert np.mean(cells[0] != cells[1]) < 0.002  # by rounding
+
+
 def test_a_scan_that_does_not_tell_the_sensor_is_refused_and_the_next_one_may() -> None:
     finds = Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="ignore")
     for few in (urban(8).points[:500], np.random.default_rng(0).uniform(-30.0, 30.0, (9000, 4)), np.ones((1, 4))):

@@ -87,7 +87,7 @@ def _seen_again(scan: Measures, points: Points, sensor: SensorProfile, frame: Mo
         scan = replace(scan, ground_m=-MODEL_HEIGHT_M, flat_axis=None, road_ahead=None)
     if frame is not None and scan.elevation_p99_deg > sensor.fov_up_deg + _TOO_HIGH_DEG:
         x, y, z = ((sample - frame.eye) @ frame.R).T
-        highest_deg = float(np.percentile(np.degrees(np.arctan2(z, np.hypot(x, y))), 99.0))
+        highest_deg = float(np.percentile(np.degrees(np.arctan2(z * np.sign(frame.R[2, 2]), np.hypot(x, y))), 99.0))
         scan = replace(scan, elevation_p99_deg=min(scan.elevation_p99_deg, highest_deg))
     return scan
 
@@ -440,7 +440,7 @@ def check_hanging(
 
     points, support_of, below_of : as in `check_ground`.
     """
-    if abs(known.roll_deg or 0.0) <= 90.0:
+    if not known.hangs:
         return ()
     turned = points.copy()
     turned[:, :3] = points[:, :3] @ known.rotation().T.astype(np.float32)

@@ -66,6 +66,11 @@ class Mounting:
         """Whether nothing is left to be estimated."""
         return None not in (self.height_m, self.roll_deg, self.pitch_deg, self.yaw_deg)
 
+    @property
+    def hangs(self) -> bool:
+        """Whether the sensor is upside down."""
+        return abs(self.roll_deg or 0.0) > 90.0
+
     def rotation(self) -> Floats:
         """R, (3, 3), from the scan's axes to the vehicle's; angles that are not known count as 0."""
         roll, pitch, yaw = (math.radians(a or 0.0) for a in (self.roll_deg, self.pitch_deg, self.yaw_deg))

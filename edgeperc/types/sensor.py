@@ -304,6 +304,12 @@ class SensorProfile:
         elevations = tuple(round(float(e), 4) for e in np.linspace(up, down, n_beams))
         return replace(self, elevations_deg=elevations, columns=max(round(360.0 / cell_deg), 8), pattern=pattern)
 
+    def upright(self, mounting: Mounting) -> SensorProfile:
+        """The profile with its beams as in the upright world: those of a sensor that hangs are turned over."""
+        if not mounting.hangs:
+            return self
+        return replace(self, elevations_deg=tuple(-deg for deg in reversed(self.elevations_deg)))
+
     @property
     def n_beams(self) -> int:
         """Number of beams."""

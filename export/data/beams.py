@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgeperc.inference.projection import row_edges
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile
 from edgeperc.types.views import RangeImageGeometry
 
@@ -40,8 +41,7 @@ def drawn_sensor(rng: np.random.Generator) -> SensorProfile:
         sensor, tilt = SPINNING[rng.integers(len(SPINNING))], rng.uniform(-0.5, 0.5)
         return replace(sensor, elevations_deg=tuple(round(deg + tilt, 2) for deg in sensor.elevations_deg))
     sensor = PATTERNED[rng.integers(len(PATTERNED))].accumulated(float(rng.uniform(*ACCUMULATED_S)))
-    hanging = tuple(-deg for deg in reversed(sensor.elevations_deg))
-    return replace(sensor, elevations_deg=hanging) if rng.random() < 0.5 else sensor
+    return sensor.upright(Mounting(roll_deg=180.0 if rng.random() < 0.5 else 0.0))
 
 
 def taken_by(sensor: SensorProfile, scan: LabeledScan, rng: np.random.Generator) -> LabeledScan:

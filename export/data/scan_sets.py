@@ -128,7 +128,7 @@ def labeled_scan(
         frame.returns,
         surface,
         (-math.pi, math.pi) if full else (low + yaw, high + yaw),
-        sensor=frame.layout.sensor,
+        sensor=frame.layout.sensor.upright(mounting),
         boxes_known=frame.boxes is not None,
     )
 
