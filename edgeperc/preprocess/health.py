@@ -200,7 +200,8 @@ def _side(azimuth_deg: float) -> str:
 
 def _everywhere(near: Ints64, lonely: Ints64) -> float:
     """Share of the near points that is lonely on nearly all sides; leaves and wires are on one side."""
-    of_sides = np.sort(lonely / np.maximum(near[:, 0], 1))[near[:, 0] >= _FEWEST_NEAR // 4]
+    known = near[:, 0] >= _FEWEST_NEAR // 4
+    of_sides = np.sort(lonely[known] / near[known, 0])
     return float(of_sides[(len(of_sides) - 1) // 3]) if len(of_sides) else 0.0
 
 
