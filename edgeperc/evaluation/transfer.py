@@ -20,7 +20,7 @@ from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor
 from ..preprocess.sensor_fit import fit_sensor
 from ..readers.captures import known_sensor, read_scans
-from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
+from ..simulation.samples import FIRST_SEED, IGNORE, in_models_frame, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from ..system.pool import map_in_processes, taken
 from ..types.choices import AUTO_SENSOR
@@ -255,7 +255,7 @@ def _simulated(sensor: SensorProfile, seed: int) -> Scan:
     raw = np.interp(spread, remissions, raws) * rng.lognormal(0.0, 0.1, len(points))
     points[:, 3] = np.minimum(np.rint(raw), raws[-1])
     objects = _objects(f"scene {seed}", zip(scan.boxes, scan.box_points, strict=True))
-    return Scan(f"scene {seed}", points, labels_by_boxes(scan), objects)
+    return Scan(f"scene {seed}", points, labels_by_boxes(in_models_frame(scan, sensor)), objects)
 
 
 def _from_image(path: Path) -> Scan:

@@ -10,11 +10,12 @@ import numpy as np
 
 from ..errors import PointsError
 from ..types.choices import PLACES
+from ..types.frame import ModelFrame
 from ..types.geometry import inside
-from ..types.mounting import Mounting
+from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.perception import Box
 from ..types.points import Bytes
-from ..types.sensor import SensorProfile
+from ..types.sensor import SensorProfile, get_sensor
 from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
 from .halls import CLEAR_M, hall
@@ -46,8 +47,8 @@ def simulated_scan(
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
-    mounting : height, and tilt relative to the vehicle; by default the sensor's height, upright. Points and boxes are
-        in the frame of the tilted sensor.
+    mounting : height, and tilt relative to the vehicle; by default the sensor's. Points and boxes are in the frame of
+        the tilted sensor.
     where : one of `edgeperc.types.choices.PLACES`; a sensor that is as high as the ceiling of a hall hangs below it.
     clumped_leaves : as of `scene.simulate`.
     """
@@ -55,7 +56,10 @@ def simulated_scan(
         raise PointsError(f"got where={where!r}; expected one of {', '.join(PLACES)}")
     if boxes is not None and where != "street":
         raise PointsError(f"got boxes and where={where!r}; a layout is that of a street")
-    rng = np.random.default_rng((seed, 1))
+    rng, profile = np.random.default_rng((seed, 1)), get_sensor(sensor)
+    if mounting is not None:
+        height_m = profile.mount_height_m if mounting.height_m is None else mounting.height_m
+        profile = replace(profile, mounting=replace(mounting, height_m=height_m))
     highest_m = math.inf
     if where == "hall":
         scene, (x, y, yaw), highest_m = hall(seed)
@@ -74,14 +78,10 @@ def simulated_scan(
         scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
     # Measured: the road is pitched by 0.4 and rolled by 0.75 degrees (medians) against the sensor.
     pitch, roll = rng.normal(0.0, 0.006), rng.normal(0.0, 0.013)
-    pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
-    if mounting is not None:
-        pose[:3, :3] = pose[:3, :3] @ mounting.rotation()
-        if mounting.height_m is not None:
-            pose[2, 3] = scene.ground_height(x, y) + mounting.height_m
+    pose = sensor_pose(scene, profile, x, y, yaw=yaw, pitch=pitch, roll=roll)
     pose[2, 3] = min(pose[2, 3], scene.ground_height(x, y) + highest_m - CLEAR_M)
     # Vehicles differ in what they hide. KITTI's car is one of them.
-    return simulate(scene, sensor, seed, pose, ego_shadow=bool(rng.random() < 0.85), clumped_leaves=clumped_leaves)
+    return simulate(scene, profile, seed, pose, ego_shadow=bool(rng.random() < 0.85), clumped_leaves=clumped_leaves)
 
 
 def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:
@@ -101,6 +101,19 @@ def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:
                 ):
                     return False
     return True
+
+
+def in_models_frame(scan: SimulatedScan, sensor: SensorProfile) -> SimulatedScan:
+    """The scan of a sensor whose profile says how it is mounted in the frame of the models; else as it is. Boxes have
+    no tilt, so that only there they hold what a tilted sensor sees of their objects.
+    """
+    if sensor.mounting == UNKNOWN_MOUNTING:
+        return scan
+    frame = ModelFrame(replace(sensor.mounting, height_m=sensor.mount_height_m, origin_m=(0.0, 0.0)))
+    T_model_sensor = np.eye(4)
+    T_model_sensor[:3, :3], T_model_sensor[:3, 3] = frame.R, frame.t
+    pose = scan.T_world_sensor @ np.linalg.inv(T_model_sensor)
+    return replace(scan, points=frame.move(scan.points), boxes=frame.move_boxes(scan.boxes), T_world_sensor=pose)
 
 
 def labels_by_boxes(scan: SimulatedScan) -> Bytes:

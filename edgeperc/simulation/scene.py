@@ -24,6 +24,8 @@ POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
 TOP_VIEW_CLASSES = ("background", "drivable", *VEHICLES)
 _SECTORS = 1800  # of the shapes that rays of a pattern may hit
+MOST_TILT_DEG = 75.0  # rays of one azimuth meet the ground one after the other; on its side, a sensor sees it twice
+_TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
 # objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.
 POINT_CLASS_OF = {**dict.fromkeys(VEHICLES, 1), "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
@@ -187,18 +189,19 @@ def sensor_pose(
     pitch: float = 0.0,
     roll: float = 0.0,
 ) -> Floats:
-    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame: rotated by
-    roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
+    """Make ``T_world_sensor`` for a sensor that is mounted as its profile says, on a vehicle at x, y [m], world frame,
+    that is rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
     """
-    T_world_sensor = np.eye(4)
+    T_world_sensor, profile = np.eye(4), get_sensor(sensor)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     cr, sr = math.cos(roll), math.sin(roll)
     T_world_sensor[:3, :3] = (
         np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
         @ np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
         @ np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+        @ profile.mounting.rotation()
     )
-    T_world_sensor[:3, 3] = x, y, scene.ground_height(x, y) + get_sensor(sensor).mount_height_m
+    T_world_sensor[:3, 3] = x, y, scene.ground_height(x, y) + profile.mount_height_m
     return T_world_sensor
 
 
@@ -224,8 +227,8 @@ def simulate(
     seed : int
         Seed of noise, drop-out and leaves. The result is the same bit for bit for the same seed.
     T_world_sensor : (4, 4) array_like, optional
-        Pose of the sensor, tilted by a few degrees at most. Default: level, along +x, ``mount_height_m`` above the
-        ground at the origin.
+        Pose of the sensor, tilted by at most 75 degrees, or so much from upside down. Default: above the ground at the
+        origin, mounted as its profile says, by default level, along +x.
     max_range_m : float
         Longest range; the sensor's range limits it too. KITTI's files end at 80 m.
     noise : bool
@@ -248,12 +251,18 @@ def simulate(
     Raises
     ------
     PointsError
-        ``T_world_sensor`` is not a rotation and a translation.
+        ``T_world_sensor`` is not a rotation and a translation, or tilts the sensor more.
     """
     profile = get_sensor(sensor)
     pose = sensor_pose(scene, profile)
     if T_world_sensor is not None:
         pose = rigid("T_world_sensor", T_world_sensor, PointsError)
+    hangs, tilt_deg = pose[2, 2] < 0.0, math.degrees(math.acos(min(abs(pose[2, 2]), 1.0)))
+    if tilt_deg > MOST_TILT_DEG:
+        raise PointsError(
+            f"the sensor is tilted by {tilt_deg:.0f} degrees, which is not simulated; expected at most "
+            f"{MOST_TILT_DEG:g} from upright or from upside down, in T_world_sensor or the mounting of the profile"
+        )
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
     if profile.pattern is None:
         step = 2.0 * math.pi / profile.columns
@@ -261,6 +270,9 @@ def simulate(
         elevations = np.radians(np.asarray(profile.elevations_deg))[:, None]
     else:
         azimuths, elevations = _pattern_rays(profile, profile.pattern, start_s, duration_s)
+    upright = pose @ _TURNED_OVER if hangs else pose  # the frame in which rays are cast
+    if hangs:
+        azimuths, elevations = -azimuths[::-1], -elevations[::-1, ::-1]
     n_beams, n_columns = len(elevations), len(azimuths)
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
     if noise and profile.pattern is None:
@@ -271,16 +283,18 @@ def simulate(
         remission_offsets = np.clip(rng.normal(-0.01, 0.075, n_beams), -0.25, 0.1)
     reach = min(float(max_range_m), profile.max_range_m)
 
-    shapes = place_shapes(scene, pose, _SECTORS if profile.pattern else n_columns, reach)
+    shapes = place_shapes(scene, upright, _SECTORS if profile.pattern else n_columns, reach)
     shape = (n_beams, n_columns)
     hits = raycast.Hits(np.empty(shape), np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     rays = raycast.Rays(elevations, azimuths, reach, np.uint64(rng.integers(0, 2**63)), clumped_leaves)
-    raycast.fill_cast(shapes, scene.ground, pose, rays, hits)
+    raycast.fill_cast(shapes, scene.ground, upright, rays, hits)
     receiver = raycast.Receiver(range_offsets, remission_offsets, profile.min_range_m, noise, noise and ego_shadow)
     points = np.empty((n_beams * n_columns, 4), dtype=np.float32)
     surfaces = np.empty(n_beams * n_columns, dtype=np.int32)
-    n = raycast.fill_points(shapes.primitives, scene.ground, pose, rays, hits, receiver, points, surfaces)
+    n = raycast.fill_points(shapes.primitives, scene.ground, upright, rays, hits, receiver, points, surfaces)
     points, surfaces = points[:n].copy(), surfaces[:n].copy()
+    if hangs:  # from the sensor's top
+        points, surfaces = points[::-1] * np.float32([1, -1, -1, 1]), surfaces[::-1].copy()
     # Shapes that are not part of an object have a negative number; -1 is the last entry, the ground.
     objects = np.maximum([*scene.primitives[:, 19], -1.0], -1.0).astype(np.int32)[surfaces]
     boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)

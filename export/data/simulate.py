@@ -17,7 +17,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.readers.images import read_image
 from edgeperc.simulation.camera import forward_camera, render
-from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.samples import in_models_frame, simulated_scan
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
@@ -51,7 +51,7 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     place = f"{where} with layouts" if real else where
-    _check_kept(out, range(first, first + n), get_sensor(sensor).name, place)
+    _check_kept(out, range(first, first + n), _profile(sensor), place)
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
     write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where, place=place)
     with mapped(write, missing, n_workers) as done:
@@ -71,13 +71,22 @@ def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
 
 
-def _check_kept(out: Path, seeds: range, sensor: str, place: str) -> None:
+def _profile(sensor: str) -> SensorProfile:
+    """The sensor of a scan in the frame of the models."""
+    profile = get_sensor(sensor)
+    return profile.upright(profile.mounting)
+
+
+def _check_kept(out: Path, seeds: range, sensor: SensorProfile, place: str) -> None:
     for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
         with np.load(path, allow_pickle=False) as data:
             profile, taken_at = (str(data[name]) if name in data else "" for name in ("sensor", "place"))
-        kept = SensorProfile.from_json(profile).name if profile else TRAINING_SENSOR
+        kept = SensorProfile.from_json(profile) if profile else get_sensor(TRAINING_SENSOR)
         if kept != sensor:
-            raise ValueError(f"{path} is a scan of {kept}, and would be kept; take another folder for {sensor}")
+            other = "another " * (kept.name == sensor.name)
+            raise ValueError(
+                f"{path} is a scan of {other}{kept.name}, and would be kept; take another folder for {sensor.name}"
+            )
         if taken_at not in (place, ""):  # earlier versions did not write it
             raise ValueError(f"{path} is a scan of a {taken_at}, and would be kept; take another folder for a {place}")
 
@@ -85,9 +94,10 @@ def _check_kept(out: Path, seeds: range, sensor: str, place: str) -> None:
 def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str, place: str) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
-    scan = LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True))
-    if sensor != TRAINING_SENSOR:
-        scan = replace(scan, sensor=get_sensor(sensor))
+    simulated = simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True)
+    scan, profile = LabeledScan.from_simulation(in_models_frame(simulated, get_sensor(sensor))), _profile(sensor)
+    if profile != get_sensor(TRAINING_SENSOR):
+        scan = replace(scan, sensor=profile)
     scan.save(_path(out, seed), place)
 
 

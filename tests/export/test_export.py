@@ -31,13 +31,16 @@ from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import fold_of
 from edgeperc.errors import CardMismatchError, ModelError
 from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.ground.planes import find_ground
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
+from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc_export import cards
 from edgeperc_export import make as make_module
@@ -809,6 +812,20 @@ def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp
     with pytest.raises(ValueError, match=r"is a scan of a street, and would be kept; .* for a hall"):
         simulate(tmp_path, 1, where="hall")
     assert len([*tmp_path.iterdir()]) == 2
+
+
+def test_a_mounting_is_simulated_and_the_scan_is_in_the_frame_of_the_models(tmp_path: Path) -> None:
+    profile, scans = tmp_path / "mine.json", tmp_path / "scans"
+    mine = replace(get_sensor("vlp-32c"), name="mine", mounting=Mounting(0.6, 180.0, 0.0))
+    profile.write_text(mine.to_json())
+    simulate(scans, 1, sensor=str(profile))
+    scan = LabeledScan.load(scans / "000000.npz")
+    assert scan.sensor is not None
+    assert scan.sensor.fov_down_deg == -15.0  # the beams that look up, of a sensor that hangs
+    assert find_ground(scan.points, mount_height_m=1.73).mask.mean() > 0.2
+    profile.write_text(replace(mine, mounting=Mounting(0.6, 0.0, 0.0)).to_json())
+    with pytest.raises(ValueError, match="is a scan of another mine, and would be kept"):
+        simulate(scans, 1, sensor=str(profile))
 
 
 @pytest.mark.usefixtures("small_views")

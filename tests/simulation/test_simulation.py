@@ -32,7 +32,7 @@ from edgeperc.simulation.raycast import (
     ground_at,
 )
 from edgeperc.simulation.roadside import add_cafe
-from edgeperc.simulation.samples import IGNORE, labels_by_boxes, labels_of_scene, simulated_scan
+from edgeperc.simulation.samples import IGNORE, in_models_frame, labels_by_boxes, labels_of_scene, simulated_scan
 from edgeperc.simulation.scene import (
     POINT_CLASS_OF,
     SCENE_CLASSES,
@@ -463,13 +463,18 @@ def test_one_beam_one_column() -> None:
     np.testing.assert_allclose(scan.points[:, :3], [[1.73 / math.tan(math.radians(10.0)), 0.0, -1.73]], atol=1e-3)
 
 
-def test_poses_move_points_and_boxes_alike() -> None:
+@pytest.mark.parametrize("mounting", [Mounting(1.73, 0.0, 0.0), Mounting(1.73, 180.0, 0.0), Mounting(1.9, -175.0, 4.0)])
+def test_poses_move_points_and_boxes_alike(mounting: Mounting) -> None:
     scene = flat(street(box("car", 14, 1.5, 0.4), box("van", 9, -4, -2.0)))
-    pose = sensor_pose(scene, SMALL, 3.0, 0.5, yaw=0.7, pitch=0.02, roll=-0.03)
-    scan = simulate(scene, SMALL, 0, pose, noise=False)
-    for k, each in enumerate(scan.boxes):
+    sensor = replace(SMALL.upright(mounting), mounting=mounting)
+    pose = sensor_pose(scene, sensor, 3.0, 0.5, yaw=0.7, pitch=0.02, roll=-0.03)
+    scan = simulate(scene, sensor, 0, pose, noise=False)
+    _, elevations_deg = angles_deg(scan.points)
+    assert (np.diff(elevations_deg) < 1e-3).all()  # beam by beam from the top
+    moved = in_models_frame(scan, sensor)
+    for k, each in enumerate(moved.boxes):
         assert scan.box_points[k] > 20
-        assert in_box(scan.points[scan.objects == k], each, 0.15).all()
+        assert in_box(moved.points[scan.objects == k], each, 0.15).all()
     world = scan.points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     np.testing.assert_allclose(world[scan.objects < 0, 2], 0.0, atol=5e-3)
 
@@ -478,6 +483,11 @@ def test_poses_move_points_and_boxes_alike() -> None:
 def test_a_pose_that_is_none_is_refused(pose: Any) -> None:
     with pytest.raises(PointsError, match="T_world_sensor"):
         simulate(street(), SMALL, 0, pose)
+
+
+def test_a_sensor_on_its_side_is_refused() -> None:
+    with pytest.raises(PointsError, match="tilted by 90 degrees, which is not simulated; expected at most 75"):
+        simulate(street(), replace(SMALL, mounting=Mounting(roll_deg=90.0)), 0)
 
 
 def test_unknown_environment_is_refused() -> None:
@@ -579,7 +589,8 @@ def test_the_background_has_parts() -> None:
 @pytest.mark.parametrize(("height_m", "pitch_deg", "roll_deg"), [(1.4, 3.0, 0.0), (2.2, -3.0, 2.0)])
 def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
     mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)
-    upright, scan = simulated_scan(6, SMALL), simulated_scan(6, SMALL, mounting=mounting)
+    upright, scan = simulated_scan(6, SMALL), simulated_scan(6, replace(SMALL, mounting=mounting))
+    np.testing.assert_array_equal(simulated_scan(6, SMALL, mounting=mounting).points, scan.points)
     turn = upright.T_world_sensor[:3, :3].T @ scan.T_world_sensor[:3, :3]
     np.testing.assert_allclose(turn, mounting.rotation(), atol=1e-12)
     assert scan.T_world_sensor[2, 3] - upright.T_world_sensor[2, 3] == pytest.approx(height_m - SMALL.mount_height_m)
