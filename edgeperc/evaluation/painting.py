@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from ..simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camer
 from ..simulation.drawn import random_scene
 from ..simulation.samples import FIRST_SEED
 from ..simulation.scene import SimulatedScan, simulate
+from ..types.mounting import Mounting
 from ..types.perception import ImageLabels
 from ..types.points import Labels, Mask
 from ..types.sensor import SensorProfile, get_sensor
@@ -40,6 +42,7 @@ def evaluate_painting(
     if n_scenes < 1:
         raise OptionError(f"n_scenes is {n_scenes}; expected at least 1")
     calibration, profile, total = forward_camera(at_m=at_m), get_sensor(sensor), Counter[str]()
+    profile = replace(profile, mounting=Mounting(profile.mounting.height_m))  # the ground is found from a level camera
     for k in range(n_scenes):
         scan = simulate(random_scene(FIRST_SEED + k), profile, FIRST_SEED + k)
         total += count_painting(scan, render(scan.scene, calibration, scan.T_world_sensor, k), calibration, profile)

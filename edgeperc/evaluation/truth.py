@@ -136,9 +136,8 @@ def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> B
     index = np.full(surface.shape, -1, np.int32)
     rising = np.flatnonzero(in_view)[np.argsort(points[in_view, 2], kind="stable")]
     index[row[rising], col[rising]] = rising
-    observed = (
-        Observer(view, frame.layout.sensor.upright(mounting)).observe(read_only(points), index, mounting).observed
-    )
+    sensor = frame.layout.sensor.upright(mounting)
+    observed = Observer(view, sensor).observe(read_only(points), index, mounting).observed
     surface[~(observed & clear)] = IGNORE
     return surface
 

@@ -107,8 +107,12 @@ def check_health(
     share = n_sampled * step / median_high(normal.returns) if known else 1.0
     is_other = not 1.0 / _OTHER_RETURNS < share < _OTHER_RETURNS
     steep = _steepness(points[::step], eye) if is_cut or is_other or not normal.is_complete else np.empty(0)
+    is_hazy = n_near >= _FEWEST_NEAR and _everywhere(near, near[:, 1]) > _HAZE
+    # Walls near by shorten the range and add returns.
+    is_dimmed = is_hazy or has_drops or has_cloud or share < _FEWER_RETURNS
     health = SensorHealth(
-        beams_missing=_beams_missing(steep, beams) if is_cut else 0,
+        # Those below what is nearly the lowest point.
+        beams_missing=int(len(beams) - 1 - np.abs(beams - steep[len(steep) // 200]).argmin()) if is_cut else 0,
         other_sensor_deg=_beyond(steep, sensor, normal) if is_other else None,
         blocked=float(blocked.sum() / max(1, N_SECTORS * is_judged.sum())),
         blocked_deg=_arcs(np.asarray(blocked.any(axis=1))),
@@ -118,9 +122,8 @@ def check_health(
         returns_share=share if known else None,
         has_drops=has_drops,
         has_cloud=has_cloud,
+        has_fog=known and is_dimmed and range_m < _SHRUNK * median_high(normal.ranges_m),
     )
-    is_hazy = n_near >= _FEWEST_NEAR and _everywhere(near, near[:, 1]) > _HAZE
-    health = replace(health, has_fog=_has_fog(health, is_hazy))
     health = replace(health, findings=tuple(text for _, text in findings_of(health)))
     return health, normal.add(counts, range_m, float(n_sampled * step), steep)
 
@@ -215,14 +218,6 @@ def _has_drops(near: Ints64, has_remission: bool) -> tuple[bool, bool]:
     return has_drops, not has_drops and bool(drops.max() > _CLOUD * near[:, 0].sum())
 
 
-def _has_fog(health: SensorHealth, is_hazy: bool) -> bool:
-    if health.normal_range_m is None or health.returns_share is None:
-        return False
-    # Walls near by shorten the range and add returns.
-    is_dimmed = is_hazy or health.has_drops or health.has_cloud or health.returns_share < _FEWER_RETURNS
-    return is_dimmed and health.range_m < _SHRUNK * health.normal_range_m
-
-
 def _blocked(counts: Floats, normal: Normal) -> Mask:
     """Which sectors are blocked in the bands that meet the ground, (N_SECTORS, 2) bool."""
     lacks, blocked = np.empty(counts.shape, np.bool_), np.zeros((N_SECTORS, 2), np.bool_)
@@ -256,11 +251,6 @@ def _steepness(points: Points, eye: Floats) -> Floats:
     xyz = points[np.isfinite(points[:, :3]).all(axis=1), :3] - eye
     flat = np.hypot(xyz[:, 0], xyz[:, 1])
     return np.sort(xyz[flat > WINDOW_M, 2] / flat[flat > WINDOW_M]) if (flat > WINDOW_M).any() else np.zeros(1)
-
-
-def _beams_missing(steep: Floats, beams: Floats) -> int:
-    """How many of the beams, by their tangents from the top, are below what is nearly the lowest point."""
-    return int(len(beams) - 1 - np.abs(beams - steep[len(steep) // 200]).argmin())
 
 
 def _reach_deg(steep: Floats) -> tuple[float, float]:

@@ -274,7 +274,8 @@ def occupancy_grid(
         raise OptionError(
             f"got cell_m={cell_m!r}, x_range_m={x_range_m!r}, y_range_m={y_range_m!r}: no grid ({exc})"
         ) from exc
-    profile, frame = sensor_behind(perception, sensor), ModelFrame(perception.mounting)
+    profile = sensor_behind(perception, sensor).upright(perception.mounting)
+    frame = ModelFrame(perception.mounting)
     moved = _returns_of(perception, points, profile, frame)
     ground = heights_above(perception.ground, moved)
 
@@ -282,9 +283,7 @@ def occupancy_grid(
     highest, tallest = np.empty(shape, np.int32), np.empty(shape, np.float32)
     corner = np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m])
     fill_standing(moved, read_only(ground.height_m), corner, float(min_height_m), OVERHEAD_M, highest, tallest)
-    observed = (
-        Observer(view, profile.upright(perception.mounting)).observe(moved, highest, perception.mounting).observed
-    )
+    observed = Observer(view, profile).observe(moved, highest, perception.mounting).observed
     for box in frame.move_boxes(perception.boxes):
         np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=footprints([box], view))
     obstacle = ~np.isnan(tallest)

@@ -12,10 +12,10 @@ from ..errors import PointsError
 from ..types.choices import PLACES
 from ..types.frame import ModelFrame
 from ..types.geometry import inside
-from ..types.mounting import UNKNOWN_MOUNTING, Mounting
+from ..types.mounting import UNKNOWN_MOUNTING
 from ..types.perception import Box
 from ..types.points import Bytes
-from ..types.sensor import SensorProfile, get_sensor
+from ..types.sensor import SensorProfile
 from .camera import CAMERA_CLASSES, true_classes
 from .drawn import random_scene
 from .halls import CLEAR_M, hall
@@ -40,26 +40,19 @@ def simulated_scan(
     sensor: str | SensorProfile = "hdl-64e",
     boxes: Sequence[Box] | None = None,
     *,
-    mounting: Mounting | None = None,
     where: str = "street",
     clumped_leaves: bool = False,
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
+    sensor : mounted on it as its profile says. Points and boxes are in its frame (`in_models_frame`).
     boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
-    mounting : height, and tilt relative to the vehicle; by default the sensor's. Points and boxes are in the frame of
-        the tilted sensor.
     where : one of `edgeperc.types.choices.PLACES`; a sensor that is as high as the ceiling of a hall hangs below it.
     clumped_leaves : as of `scene.simulate`.
     """
     if where not in PLACES:
         raise PointsError(f"got where={where!r}; expected one of {', '.join(PLACES)}")
-    if boxes is not None and where != "street":
-        raise PointsError(f"got boxes and where={where!r}; a layout is that of a street")
-    rng, profile = np.random.default_rng((seed, 1)), get_sensor(sensor)
-    if mounting is not None:
-        height_m = profile.mount_height_m if mounting.height_m is None else mounting.height_m
-        profile = replace(profile, mounting=replace(mounting, height_m=height_m))
+    rng = np.random.default_rng((seed, 1))
     highest_m = math.inf
     if where == "hall":
         scene, (x, y, yaw), highest_m = hall(seed)
@@ -78,10 +71,10 @@ def simulated_scan(
         scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
     # Measured: the road is pitched by 0.4 and rolled by 0.75 degrees (medians) against the sensor.
     pitch, roll = rng.normal(0.0, 0.006), rng.normal(0.0, 0.013)
-    pose = sensor_pose(scene, profile, x, y, yaw=yaw, pitch=pitch, roll=roll)
+    pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
     pose[2, 3] = min(pose[2, 3], scene.ground_height(x, y) + highest_m - CLEAR_M)
     # Vehicles differ in what they hide. KITTI's car is one of them.
-    return simulate(scene, profile, seed, pose, ego_shadow=bool(rng.random() < 0.85), clumped_leaves=clumped_leaves)
+    return simulate(scene, sensor, seed, pose, ego_shadow=bool(rng.random() < 0.85), clumped_leaves=clumped_leaves)
 
 
 def _is_free(scene: Scene, x: float, y: float, yaw: float) -> bool:

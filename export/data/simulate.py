@@ -51,9 +51,10 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     place = f"{where} with layouts" if real else where
-    _check_kept(out, range(first, first + n), _profile(sensor), place)
+    profile = get_sensor(sensor)
+    _check_kept(out, range(first, first + n), profile.upright(profile.mounting), place)
     missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
-    write = partial(_simulate, out=out, layouts=real, sensor=sensor, where=where, place=place)
+    write = partial(_simulate, out=out, layouts=real, sensor=profile, where=where, place=place)
     with mapped(write, missing, n_workers) as done:
         for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
             pass
@@ -71,12 +72,6 @@ def _path(out: Path, seed: int) -> Path:
     return out / f"{seed:06d}.npz"
 
 
-def _profile(sensor: str) -> SensorProfile:
-    """The sensor of a scan in the frame of the models."""
-    profile = get_sensor(sensor)
-    return profile.upright(profile.mounting)
-
-
 def _check_kept(out: Path, seeds: range, sensor: SensorProfile, place: str) -> None:
     for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
         with np.load(path, allow_pickle=False) as data:
@@ -91,13 +86,15 @@ def _check_kept(out: Path, seeds: range, sensor: SensorProfile, place: str) -> N
             raise ValueError(f"{path} is a scan of a {taken_at}, and would be kept; take another folder for a {place}")
 
 
-def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str, where: str, place: str) -> None:
+def _simulate(
+    seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: SensorProfile, where: str, place: str
+) -> None:
     # 4,973 is prime: neighboring seeds take layouts of different drives.
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
     simulated = simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True)
-    scan, profile = LabeledScan.from_simulation(in_models_frame(simulated, get_sensor(sensor))), _profile(sensor)
-    if profile != get_sensor(TRAINING_SENSOR):
-        scan = replace(scan, sensor=profile)
+    scan = LabeledScan.from_simulation(in_models_frame(simulated, sensor))
+    if sensor != get_sensor(TRAINING_SENSOR):
+        scan = replace(scan, sensor=sensor.upright(sensor.mounting))
     scan.save(_path(out, seed), place)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,8 @@ def test_a_ceiling_is_found_at_its_height(place: Callable[[int, str], SimulatedS
 def test_a_street_has_no_ceiling(sensor: str) -> None:
     for seed in SEEDS[:2]:
         assert find_ceiling(simulated_scan(seed, sensor).points) is None
-    high = simulated_scan(1, sensor, mounting=Mounting(6.0, 0.0, 0.0, 0.0)).points + np.float32([0, 0, 4.27, 0])
-    assert find_ceiling(high, 4.27) is None
+    high = simulated_scan(1, replace(get_sensor(sensor), mounting=Mounting(6.0))).points
+    assert find_ceiling(high + np.float32([0, 0, 4.27, 0]), 4.27) is None
 
 
 def test_walls_that_end_where_the_rays_do_are_no_ceiling() -> None:

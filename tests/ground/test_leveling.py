@@ -426,7 +426,7 @@ def test_high_sensors_are_found_from_the_ground(sensor: str, height_m: float) ->
 
 @pytest.mark.parametrize(("sensor", "height_m"), [("vlp-16", 8.0), ("os1-64", 5.0), ("hdl-64e", 6.5)])
 def test_a_height_that_is_found_from_afar_is_not_said_in_silence(sensor: str, height_m: float) -> None:
-    points = simulated_scan(5, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
+    points = simulated_scan(5, replace(get_sensor(sensor), mounting=Mounting(height_m))).points
     points = points * np.float32([1, 1, 1, get_sensor(sensor).remission_range[1]])
     told = "its height may be off by a meter: pass mounting="
     for known in (Mounting(), Mounting(height_m), Mounting(height_m, 0.0, 0.0)):
@@ -441,7 +441,7 @@ def test_a_height_that_is_found_from_afar_is_not_said_in_silence(sensor: str, he
 def test_heights_above_uneven_land_are_nearly_found() -> None:
     errors = []
     for sensor, height_m, seed in product(("os1-64", "hdl-64e", "pandar64", "vlp-16"), (3.0, 5.0, 6.5), range(40, 42)):
-        points = simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points
+        points = simulated_scan(seed, replace(get_sensor(sensor), mounting=Mounting(height_m))).points
         found = MountingEstimator(Mounting()).add(points).mounting().height_m
         errors.append(abs((found or 0.0) - height_m))
     assert np.quantile(errors, 0.9) < 0.5
@@ -529,7 +529,7 @@ def test_a_bank_beside_the_sensor_is_no_ground_below_it(toward_deg: float) -> No
 @pytest.mark.parametrize(("seed", "height_m"), [(101, 2.2), (105, 2.2), (111, 3.0)])
 def test_a_height_from_little_ground_is_said(seed: int, height_m: float) -> None:
     sensor = replace(get_sensor("mid-360").accumulated(0.2), remission=None, remission_range=(0.0, 1.0))
-    points = simulated_scan(2 * 10**9 + seed, sensor, mounting=Mounting(height_m, 0.0, 0.0)).points
+    points = simulated_scan(2 * 10**9 + seed, replace(sensor, mounting=Mounting(height_m))).points
     for known in (Mounting(), Mounting(height_m)):
         found = Perceiver(["ssadnet"], sensor=sensor, mounting=known, on_mismatch="warn")
         with warnings.catch_warnings():

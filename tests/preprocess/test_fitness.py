@@ -461,10 +461,10 @@ def test_the_coordinates_of_a_map_as_float32(place: tuple[float, float, float]) 
 )
 def test_high_sensors_are_accepted_with_their_height(sensor: str, height_m: float) -> None:
     """They see little of the ground near by, and objects from above: as high as their beams, in their own frame."""
-    profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
+    mounting = Mounting(height_m, 0.0, 0.0, 0.0)
+    profile = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None, mounting=mounting)
     for seed in SEEDS[:2]:
-        points = condition(simulated_scan(seed, sensor, mounting=Mounting(height_m, 0.0, 0.0, 0.0)).points, profile)[0]
-        frame = ModelFrame(Mounting(height_m, 0.0, 0.0, 0.0))
+        points, frame = condition(simulated_scan(seed, profile).points, profile)[0], ModelFrame(mounting)
         assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
         wrong = ModelFrame(Mounting(height_m + 3.0, 0.0, 0.0, 0.0))
         found = [finding for finding in check_profiles(wrong.move(points), PROFILES, profile, wrong) if finding.gross]
@@ -475,9 +475,10 @@ def test_high_sensors_are_accepted_with_their_height(sensor: str, height_m: floa
 def test_sensors_that_lean_are_accepted_with_their_tilt(roll_deg: float, pitch_deg: float) -> None:
     """A part of the beams points higher than that of a level sensor."""
     mounting = Mounting(6.0, roll_deg, pitch_deg, 0.0)
-    profile, frame = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0), remission=None), ModelFrame(mounting)
+    profile = replace(get_sensor("os1-64"), remission_range=(0.0, 1.0), remission=None, mounting=mounting)
+    frame = ModelFrame(mounting)
     for seed in SEEDS[:2]:
-        points = condition(simulated_scan(seed, "os1-64", mounting=mounting).points, profile)[0]
+        points = condition(simulated_scan(seed, profile).points, profile)[0]
         assert not any(finding.gross for finding in check_profiles(frame.move(points), PROFILES, profile, frame))
 
 
@@ -502,7 +503,7 @@ def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
 def test_a_sensor_that_looks_up_is_the_right_way_up(seed: int) -> None:
     """Of an upright Mid-360, in streets in which it sees little road, or a roof above, and few rows."""
     sensor = replace(get_sensor("mid-360").accumulated(0.2), remission=None, remission_range=(0.0, 1.0))
-    points = simulated_scan(2 * 10**9 + seed, sensor, mounting=MODEL_MOUNTING).points
+    points = simulated_scan(2 * 10**9 + seed, replace(sensor, mounting=MODEL_MOUNTING)).points
     assert not check_ground(points, near_support, share_below, sensor)
     assert not [finding for finding in check_profiles(points, PROFILES, sensor) if finding.gross]
     hanging = points * TURNED["about x"]

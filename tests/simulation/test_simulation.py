@@ -46,8 +46,9 @@ from edgeperc.simulation.scene import (
     simulate_sequence,
 )
 from edgeperc.simulation.shapes import block
-from edgeperc.simulation.street import SIZES, Street
+from edgeperc.simulation.street import SIZES
 from edgeperc.types.choices import STATIC
+from edgeperc.types.geometry import inside
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile, get_sensor
@@ -85,13 +86,6 @@ def plate(
     x: float, size: tuple[float, float, float], z: float = 0.0, material: int = 0, density: float = 1.0
 ) -> np.ndarray:
     return np.array(block(material, 0.4, (x, 0.0, z), size, density=density))
-
-
-def in_box(points: np.ndarray, each: Box, grown: float) -> np.ndarray:
-    away = points[:, :3].astype(np.float64) - each.center
-    cos, sin = math.cos(each.yaw), math.sin(each.yaw)
-    local = np.stack([cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0], away[:, 2]], axis=1)
-    return np.all(np.abs(local) <= np.array(each.size) / 2 + grown, axis=1)
 
 
 KEY = np.uint64(99)
@@ -342,7 +336,7 @@ def test_a_scan_is_consistent(environment: str) -> None:
         mine = scan.objects == k
         assert int(mine.sum()) == scan.box_points[k]
         assert (scan.labels[mine] == POINT_CLASS_OF.get(each.label, 0)).all()
-        assert in_box(scan.points[mine], each, 0.12).all()
+        assert inside(each, scan.points[mine], 0.12).all()
     assert (scan.labels[scan.objects < 0] == 0).all()
 
 
@@ -367,7 +361,7 @@ def test_shapes_fill_their_boxes(label: str, a: float, b: float, c: float, yaw: 
     mine = scan.points[scan.objects == 0]
     assert len(mine) > 5
     # Handlebars stick out of the narrowest cyclists by 4.3 cm, elbows out of pedestrians by 3.2 cm (of 1,500 shapes).
-    assert in_box(mine, scan.boxes[0], 0.05 if label in ("cyclist", "pedestrian") else 0.03).all()
+    assert inside(scan.boxes[0], mine, 0.05 if label in ("cyclist", "pedestrian") else 0.03).all()
     # It reaches near its own top, and what shows is not a sliver of the box.
     assert np.ptp(mine[:, 2]) > 0.6 * size[2]
     assert math.hypot(np.ptp(mine[:, 0]), np.ptp(mine[:, 1])) > 0.4 * min(size[0], size[1])
@@ -385,13 +379,14 @@ def test_same_seeds_same_bits() -> None:
     assert first.points.tobytes() == second.points.tobytes()
 
 
-def test_points_run_laser_by_laser_from_the_top() -> None:
-    scan = simulate(street(), SMALL, 0, noise=False)
-    elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])))
-    beam = np.abs(elevation[:, None] - np.array(SMALL.elevations_deg)).argmin(axis=1)
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
+def test_points_run_laser_by_laser_from_the_top(roll_deg: float) -> None:
+    sensor = replace(SMALL, mounting=Mounting(roll_deg=roll_deg))
+    scan = simulate(street(), sensor, 0, noise=False)
+    azimuth, elevation = angles_deg(scan.points)
+    beam = np.abs(elevation[:, None] - np.array(sensor.elevations_deg)).argmin(axis=1)
     assert (np.diff(beam) >= 0).all()
-    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]) % (2 * np.pi)
-    azimuth[azimuth > 2 * np.pi - 1e-5] = 0.0
+    azimuth = (azimuth + 1e-3) % 360.0
     assert (np.diff(azimuth)[np.diff(beam) == 0] > 0).all()
 
 
@@ -436,26 +431,12 @@ def test_noise_drop_out_and_shadow_take_points_away() -> None:
     assert 0.001 < np.std(noisy.points[near, 2] + 1.73) < 0.03
 
 
-@pytest.mark.parametrize("height_m", [0.4, 1.73, 3.5])
-def test_mounting_height(height_m: float) -> None:
-    scan = simulate(flat(street()), replace(SMALL, mounting=Mounting(height_m=height_m)), 0, noise=False)
-    np.testing.assert_allclose(scan.points[:, 2], -height_m, atol=3e-3)
-
-
 def test_a_sensor_below_the_ground_or_in_a_box_does_not_fail() -> None:
     scene = street(box("truck", 0.0, 0.0))
     for z in (-3.0, 0.0, 1.0, 50.0):
         pose = np.eye(4)
         pose[2, 3] = z
         assert np.isfinite(simulate(scene, SMALL, 0, pose).points).all()
-
-
-@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e", "os0-128"])
-def test_other_sensors(sensor: str) -> None:
-    scan = simulate(random_scene(2, "urban"), sensor, 1)
-    assert len(scan.points) > 8000
-    assert scan.points[:, 3].max() <= 0.99
-    assert (scan.labels == 1).any()
 
 
 def test_one_beam_one_column() -> None:
@@ -469,30 +450,21 @@ def test_poses_move_points_and_boxes_alike(mounting: Mounting) -> None:
     sensor = replace(SMALL.upright(mounting), mounting=mounting)
     pose = sensor_pose(scene, sensor, 3.0, 0.5, yaw=0.7, pitch=0.02, roll=-0.03)
     scan = simulate(scene, sensor, 0, pose, noise=False)
-    _, elevations_deg = angles_deg(scan.points)
-    assert (np.diff(elevations_deg) < 1e-3).all()  # beam by beam from the top
     moved = in_models_frame(scan, sensor)
     for k, each in enumerate(moved.boxes):
         assert scan.box_points[k] > 20
-        assert in_box(moved.points[scan.objects == k], each, 0.15).all()
+        assert inside(each, moved.points[scan.objects == k], 0.15).all()
     world = scan.points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     np.testing.assert_allclose(world[scan.objects < 0, 2], 0.0, atol=5e-3)
 
 
-@pytest.mark.parametrize("pose", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2.0, 2.0, 1.0]), "here"])
+ON_ITS_SIDE = np.eye(4)[[0, 2, 1, 3]] * [[1.0], [-1.0], [1.0], [1.0]]
+
+
+@pytest.mark.parametrize("pose", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), "here", ON_ITS_SIDE])
 def test_a_pose_that_is_none_is_refused(pose: Any) -> None:
     with pytest.raises(PointsError, match="T_world_sensor"):
         simulate(street(), SMALL, 0, pose)
-
-
-def test_a_sensor_on_its_side_is_refused() -> None:
-    with pytest.raises(PointsError, match="tilted by 90 degrees, which is not simulated; expected at most 75"):
-        simulate(street(), replace(SMALL, mounting=Mounting(roll_deg=90.0)), 0)
-
-
-def test_unknown_environment_is_refused() -> None:
-    with pytest.raises(PointsError, match="moon"):
-        random_scene(0, "moon")
 
 
 @pytest.mark.compiled
@@ -509,21 +481,12 @@ def test_top_view_labels() -> None:
             here = np.array([[x, y, 0.0]])
             expected = int(twins.simulation.ground(scan.scene, np.array([x]), np.array([y]))[1][0] < 0)
             for each in (car, truck):
-                if in_box(here, replace(each, center=(*each.center[:2], 0.0)), 0.0)[0]:
+                if inside(replace(each, center=(*each.center[:2], 0.0)), here)[0]:
                     expected = TOP_VIEW_CLASSES.index(each.label)
             assert labels[row, col] == expected
     cells = np.count_nonzero(labels == 2) * view.cell_m**2
     assert cells == pytest.approx(3.9 * 1.6, rel=0.03)
     assert set(np.unique(labels)) == {0, 1, 2, 4}
-
-
-def test_bays_are_not_drivable() -> None:
-    scene = flat(street())
-    bay = (*scene.strips[0, :5], 20.0, 25.0, 10.0, 20.0, 1.0)
-    scene = replace(scene, strips=np.vstack([scene.strips[:1], bay]))
-    x, y, _ = Street(np.random.default_rng(0), list(scene.strips), scene.terrain).on_strip(15.0, 22.0)
-    assert not scene.on_road(x, y)
-    assert scene.on_road(5.0, 0.0)
 
 
 def test_islands_are_raised_and_not_drivable() -> None:
@@ -590,7 +553,6 @@ def test_the_background_has_parts() -> None:
 def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
     mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)
     upright, scan = simulated_scan(6, SMALL), simulated_scan(6, replace(SMALL, mounting=mounting))
-    np.testing.assert_array_equal(simulated_scan(6, SMALL, mounting=mounting).points, scan.points)
     turn = upright.T_world_sensor[:3, :3].T @ scan.T_world_sensor[:3, :3]
     np.testing.assert_allclose(turn, mounting.rotation(), atol=1e-12)
     assert scan.T_world_sensor[2, 3] - upright.T_world_sensor[2, 3] == pytest.approx(height_m - SMALL.mount_height_m)
@@ -642,8 +604,7 @@ def test_layout_keeps_its_boxes() -> None:
         box("pedestrian", 14, -7.0, 1.0),
     ]
     scene = scene_from_boxes(boxes, 2)
-    known = [each for each in boxes if each.label in LABELS]
-    for made, given_box in zip(scene.objects, known, strict=False):
+    for made, given_box in zip(scene.objects, boxes, strict=False):
         assert made.label == given_box.label
         assert made.size == given_box.size
         np.testing.assert_allclose(made.center[:2], given_box.center[:2])
@@ -652,7 +613,7 @@ def test_layout_keeps_its_boxes() -> None:
         assert made.center[2] - made.size[2] / 2 == pytest.approx(ground)
     assert all(scene.on_road(*each.center[:2]) for each in boxes if each.label in ("car", "van"))
     scan = simulate(scene, SMALL, 0)
-    near = [math.hypot(*each.center[:2]) < 35.0 for each in known]  # the one beyond is as small as a person
+    near = [math.hypot(*each.center[:2]) < 35.0 for each in boxes]  # the one beyond is as small as a person
     assert all(points > 0 for points, close in zip(scan.box_points, near, strict=False) if close)
 
 
@@ -729,7 +690,6 @@ def test_a_pattern_fills_its_field_of_view_and_does_not_repeat(name: str) -> Non
     sensor = get_sensor(name)
     first, second = patterned(name, 0.1), patterned(name, 0.1, 0.1)
     assert len(first.points) == pytest.approx(0.1 * sensor.pattern.points_per_s, rel=0.01)
-    np.testing.assert_array_equal(patterned(name, 0.1).points, first.points)
     azimuth, elevation = angles_deg(first.points)
     half_deg = sensor.pattern.width_deg / 2.0
     assert np.abs(azimuth).max() == pytest.approx(half_deg, rel=0.02)

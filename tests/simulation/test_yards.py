@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgeperc.errors import PointsError
+from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.yards import TRUCKS, yard
 from edgeperc.types.geometry import oriented_iou, rectangles
@@ -40,8 +41,8 @@ def test_walls_of_a_yard_have_returns_and_belong_to_no_object() -> None:
     assert np.count_nonzero((scan.objects < 0) & (scan.points[:, 2] > -1.0)) > 200
 
 
-def test_other_places_and_layouts_of_yards_are_refused() -> None:
+def test_other_places_are_refused() -> None:
     with pytest.raises(PointsError, match="expected one of street, hall, yard"):
         simulated_scan(0, where="forest")
-    with pytest.raises(PointsError, match="a layout is that of a street"):
-        simulated_scan(0, boxes=[], where="yard")
+    with pytest.raises(PointsError, match="moon"):
+        random_scene(0, "moon")
