@@ -67,8 +67,7 @@ def scan_of(seed: int, sensor: SensorProfile, height_m: float, place: str) -> Si
         primitives[fixed, 6] += math.tan(roll) * primitives[fixed, 5]
         scene = replace(scene, terrain=terrain, objects=tuple(objects), primitives=primitives)
     x, y = beside(scene) if place == "pavement" else (0.0, 0.0)
-    pose = sensor_pose(scene, sensor, x, y, roll=roll)
-    pose[2, 3] = scene.ground_height(x, y) + height_m
+    pose = sensor_pose(scene, replace(sensor, mounting=Mounting(height_m)), x, y, roll=roll)
     scan = simulate(scene, sensor, seed, pose, ego_shadow=height_m >= 1.5)
     behind = scan.points[:, 0] < 0.0
     if place == "half":

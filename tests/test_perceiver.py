@@ -773,8 +773,7 @@ def test_a_sensor_that_hangs_sees_what_one_with_its_beams_turned_over_sees() -> 
     sensor = replace(get_sensor("hdl-32e"), remission_range=(0.0, 1.0), mounting=hung)
     turned = replace(sensor.upright(hung), mounting=MODEL_MOUNTING)
     scan = urban(8, turned).points
-    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
-    level, hanging = (Perceiver("ssadnet", sensor=each, **options) for each in (turned, sensor))
+    level, hanging = (Perceiver("ssadnet", sensor=each, on_mismatch="ignore") for each in (turned, sensor))
     answers = level(scan), hanging(scan * np.float32([1, -1, -1, 1]))
     cells, findings = zip(*((a.require_top_view().drivable, a.health.findings) for a in answers), strict=True)
     assert findings == ((), ())

@@ -488,7 +488,6 @@ def _suiting_models(
 
     rows: list[tuple[str, str]] = []
     findings: dict[str, list[str] | None] = {}
-    upright = sensor.upright(sensor.mounting)
     for card in {variant.name: variant.card for variant in listed()}.values():
         if card.view.kind in ("camera", "objects"):  # objects are of any scan
             continue
@@ -496,7 +495,7 @@ def _suiting_models(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), upright, frame)
+        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor.upright(sensor.mounting), frame)
         sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
         findings[card.name] = sentences
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]

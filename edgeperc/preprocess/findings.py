@@ -365,7 +365,7 @@ _ASYMMETRIC_DEG = 8.0  # of beams that tell up from down
 
 def _off_beams(scan: Measures, sensor: SensorProfile) -> tuple[float, float]:
     """How far the highest and lowest points are from the beams of a sensor the right way up, and upside down [deg]."""
-    up, down = max(sensor.elevations_deg), min(sensor.elevations_deg)
+    up, down = sensor.fov_up_deg, sensor.fov_down_deg
     highest, lowest = scan.elevation_p99_deg, scan.elevation_p01_deg
     return abs(highest - up) + abs(lowest - down), abs(highest + down) + abs(lowest + up)
 
@@ -375,7 +375,7 @@ def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
 
     points : (n, 4) float32; returns in the frame of the scan, before a mounting moves them.
     """
-    up, down = max(sensor.elevations_deg), min(sensor.elevations_deg)
+    up, down = sensor.fov_up_deg, sensor.fov_down_deg
     scan = measure(points, (180.0, -180.0)) if abs(up + down) > _ASYMMETRIC_DEG else None
     # Elevations about an origin on the road, as in the frame of a vehicle, are as high; its ground is not above it.
     if scan is None or scan.ground_m is None or scan.ground_m <= 0.5:

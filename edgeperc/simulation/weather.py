@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from ..types.points import Floats, Floats32, Points
 
-Scan = Floats32
-
 DIVERGENCE_RAD = 3e-3  # of the beam
 MAX_RANGE_M = 120.0  # of the sensor
 DROP_REMISSION = 0.02  # of water and ice at normal incidence
@@ -30,20 +28,20 @@ _PULSE_S, _LIGHT_M_PER_S = 20e-9, 299792458.0
 _CROSSOVER_M = (0.9, 1.0)  # between which the receiver begins to see the beam
 
 
-def dirty(points: Points, left_deg: float, right_deg: float, lost: float = 1.0, *, seed: int = 0) -> Scan:
+def dirty(points: Points, left_deg: float, right_deg: float, lost: float = 1.0, *, seed: int = 0) -> Floats32:
     """Dirt on the window from an azimuth to another one on its right, which keeps a share of the returns away."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     behind = (left_deg - azimuth) % 360.0 <= (left_deg - right_deg) % 360.0
     return points[~(behind & (np.random.default_rng(seed).random(len(points)) < lost))].astype(np.float32)
 
 
-def rain(points: Points, rate_mm_h: float, *, seed: int = 0) -> Scan:
+def rain(points: Points, rate_mm_h: float, *, seed: int = 0) -> Floats32:
     """Rain: drops in the beams, and lost returns."""
     slope, per_m = 4.1 * rate_mm_h**-0.21, 0.01 * rate_mm_h**0.6
     return _fallen(points, (8000.0, slope, per_m), seed)
 
 
-def snow(points: Points, rate_mm_h: float, *, seed: int = 0) -> Scan:
+def snow(points: Points, rate_mm_h: float, *, seed: int = 0) -> Floats32:
     """Snow, by its rate as water: flakes in the beams, and lost returns."""
     n0, slope = 7.6e3 * rate_mm_h**-0.87, 2.55 * rate_mm_h**-0.48
     # The cross-sections of all flakes take from the beam: pi/4 times the second moment of their sizes.
@@ -53,7 +51,7 @@ def snow(points: Points, rate_mm_h: float, *, seed: int = 0) -> Scan:
 
 def cloud(
     points: Points, center_m: tuple[float, float, float], radius_m: float, per_m: float, *, seed: int = 0
-) -> Scan:
+) -> Floats32:
     """A ball of dust, spray or exhaust: a beam through it returns from inside with this probability a meter."""
     rng, ranges, rays = _beams(points, seed)
     along = rays @ np.array(center_m)
@@ -63,7 +61,7 @@ def cloud(
     return _with_drops(points, rays, ranges, np.where((half > 0.0) & (at < along + half), at, np.inf))
 
 
-def fog(points: Points, visibility_m: float, *, seed: int = 0) -> Scan:
+def fog(points: Points, visibility_m: float, *, seed: int = 0) -> Floats32:
     """Fog by its visibility (meteorological optical range): attenuated returns, and those of the fog itself."""
     rng, ranges, rays = _beams(points, seed)
     per_m, backscatter = math.log(20.0) / visibility_m, 0.046 / visibility_m
@@ -90,7 +88,7 @@ def _beams(points: Points, seed: int) -> tuple[np.random.Generator, Floats, Floa
     return np.random.default_rng(seed), ranges, points[:, :3] / np.maximum(ranges, 1e-9)[:, None]
 
 
-def _fallen(points: Points, sizes: tuple[float, float, float], seed: int) -> Scan:
+def _fallen(points: Points, sizes: tuple[float, float, float], seed: int) -> Floats32:
     """sizes : number of drops per m3 and mm of diameter that the exponential begins with, its slope [1/mm], and the
         attenuation [1/m].
     Returns of drops that are nearer than the target and bright enough; targets that are too dim are lost.
@@ -111,7 +109,7 @@ def _fallen(points: Points, sizes: tuple[float, float, float], seed: int) -> Sca
     return wet[(at < ranges) | (power >= least)]
 
 
-def _with_drops(points: Points, rays: NDArray[np.floating], ranges: NDArray[np.floating], at: Floats) -> Scan:
+def _with_drops(points: Points, rays: NDArray[np.floating], ranges: NDArray[np.floating], at: Floats) -> Floats32:
     """Points whose beams meet a drop before their target are at the drop, with its low remission."""
     wet = points.astype(np.float32)
     nearer = at < ranges
