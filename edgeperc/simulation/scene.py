@@ -294,7 +294,7 @@ def simulate(
     n = raycast.fill_points(shapes.primitives, scene.ground, upright, rays, hits, receiver, points, surfaces)
     points, surfaces = points[:n].copy(), surfaces[:n].copy()
     if hangs:  # from the sensor's top
-        points, surfaces = points[::-1] * np.float32([1, -1, -1, 1]), surfaces[::-1].copy()
+        points, surfaces = points[::-1] * np.array([1, -1, -1, 1], np.float32), surfaces[::-1].copy()
     # Shapes that are not part of an object have a negative number; -1 is the last entry, the ground.
     objects = np.maximum([*scene.primitives[:, 19], -1.0], -1.0).astype(np.int32)[surfaces]
     boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)

@@ -82,12 +82,13 @@ def build_samples(
     real: bool,
     detector: bool = True,
     n_workers: int = 0,
+    made_of: str = "",
 ) -> str:
     """Write the samples of scans of drives into ``folder``, in parts; finished ones of the same scans and labels are
-    kept. Returns the digest that says which these are.
+    kept. ``made_of`` says which these are, `digest_of` the scans by default; returns it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    made_of, note = digest_of(scans), folder / f"{name}.sha256"
+    made_of, note = made_of or digest_of(scans), folder / f"{name}.sha256"
     if not note.exists() or note.read_text() != made_of:
         for stale in _parts(folder, name):
             stale.unlink()
