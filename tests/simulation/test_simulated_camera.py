@@ -143,7 +143,6 @@ def test_true_classes_of_points(scan: SimulatedScan) -> None:
     assert true.shape == (len(scan.points),)
     for k, label in enumerate(("Car", "Pedestrian", "Bicyclist"), start=1):
         assert (true[scan.labels == k] == CAMERA_CLASSES.index(label)).all()
-    assert (scan.surfaces[scan.objects >= 0] >= 0).all()
     owner = np.append(scan.scene.primitives[:, 19], -1.0)[scan.surfaces]
     np.testing.assert_array_equal(np.maximum(owner, -1.0), scan.objects)
     ground = scan.surfaces == -1
