@@ -188,7 +188,7 @@ def road_ahead(
     PointsError
         The tolerance is negative or NaN.
     OptionError
-        ``max_corners`` is below 4.
+        ``max_corners`` is below 4, or ``top_view`` is none, such as a whole perception.
 
     Examples
     --------
@@ -264,7 +264,7 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box | Track] = (), *, half_wid
     Raises
     ------
     OptionError
-        ``half_width_m`` is negative or NaN.
+        ``half_width_m`` is negative or NaN, or ``top_view`` is none, such as a whole perception.
 
     Examples
     --------
@@ -277,7 +277,9 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box | Track] = (), *, half_wid
 
 
 def _standing(top_view: TopView, boxes: Iterable[Box | Track]) -> tuple[Box, ...]:
-    """Boxes and those of tracks in the frame of the cells."""
+    """Boxes and those of tracks in the frame of the cells. OptionError for what is no top view."""
+    if not isinstance(top_view, TopView):
+        raise OptionError(f"got a {type(top_view).__name__} for top_view; pass perception.require_top_view()")
     return ModelFrame(top_view.mounting).move_boxes(each if isinstance(each, Box) else each.box for each in boxes)
 
 

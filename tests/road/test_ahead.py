@@ -316,3 +316,6 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
             free_ahead(view(blank()), half_width_m=half_width_m)
     with pytest.raises(OptionError, match="max_corners is 3; expected at least 4"):
         road_ahead(view(blank()), max_corners=3)
+    for measure in (road_ahead, free_ahead):
+        with pytest.raises(OptionError, match=r"got a NoneType for top_view; pass perception.require_top_view\(\)"):
+            measure(None)
