@@ -18,6 +18,8 @@ from ..readers.files import parse_points
 from ..sinks.prelabels import cvat_cuboid
 from ..system.names import nearest
 
+__all__ = ["OPTIONS_VARIABLE", "CvatFunction", "handler", "init_context"]
+
 OPTIONS_VARIABLE = "EDGEPERC_OPTIONS"
 """Environment variable with the function's options of a `Perceiver`, a JSON object."""
 

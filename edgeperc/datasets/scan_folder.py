@@ -54,6 +54,8 @@ from .layout import (
     read_layout,
 )
 
+__all__ = ["ScanFolder", "ScanFrame"]
+
 MARGIN_M = 0.05  # a label box is often a little smaller than its object
 
 

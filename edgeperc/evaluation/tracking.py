@@ -30,6 +30,8 @@ from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 
+__all__ = ["CLASSES", "KINDS", "RULES", "evaluate_kitti"]
+
 CLASSES = ("car", "pedestrian", "cyclist")
 
 # Labels of each evaluated class; KUL-Seg's Table 7 evaluates vehicles.

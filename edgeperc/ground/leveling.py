@@ -15,6 +15,8 @@ from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.points import Floats, Ints, Points, read_only
 from .planes import CELL_M, N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
+__all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
+
 # What differs from the training vehicle by less, or by less than two standard deviations, is taken for the street's own
 # slope and camber: scans stay as they are. An error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one
 # and three points of IoU of cars.

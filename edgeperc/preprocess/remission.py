@@ -25,6 +25,8 @@ from .sensor_fit import (
     stratify,
 )
 
+__all__ = ["FROZEN_AFTER", "NO_REMISSION", "RemissionMatcher", "is_missing"]
+
 FROZEN_AFTER = 5  # scans
 
 # What the networks get if there is no remission, between what is best for the simulation-only network (car IoU on 31

@@ -29,6 +29,8 @@ from ..types.points import Bytes, Floats, Mask, as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
 
+__all__ = ["CLOUD", "LIVE_OUTPUTS", "OUTPUTS", "RosMessages", "nanoseconds"]
+
 CLOUD = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 OUTPUTS: Mapping[str, str] = {

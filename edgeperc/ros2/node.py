@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from ..types.perception import Perception
     from ..types.points import Floats32
 
+__all__ = ["PerceptionNode"]
+
 USUAL_OUTPUTS = (*messages.OUTPUTS, messages.GROUND_POINTS, messages.OBSTACLE_POINTS)
 """What a node publishes unless it is told otherwise."""
 REPORT_EVERY_S = 1.0

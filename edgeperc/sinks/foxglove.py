@@ -42,6 +42,8 @@ from . import scene
 from .relay import MAX_VIEWERS, Relay
 from .run_file import RunFile
 
+__all__ = ["STATUS_SCHEMA", "McapSink", "ServeSink"]
+
 _POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "remission")]
     + [(name, "u1") for name in ("red", "green", "blue", "alpha", "class")]

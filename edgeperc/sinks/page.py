@@ -11,6 +11,8 @@ from ..view.page import DrivePage
 from .run_file import warn_of
 from .scene import checked_target
 
+__all__ = ["PageSink"]
+
 
 class PageSink:
     """Writes all scans of a run to one self-contained HTML page with a play bar; see `edgeperc.view.DrivePage`.

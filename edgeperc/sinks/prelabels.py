@@ -23,6 +23,8 @@ from ..types.points import Floats
 from ..view.content import edges_ahead
 from .run_file import RunFile, ScanFiles, stem_of, warn_of
 
+__all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
+
 KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
 """The tools and formats."""
 

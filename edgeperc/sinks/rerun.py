@@ -22,6 +22,8 @@ from ..view.content import box_text, drivable_strips, track_text
 from .run_file import Pipe, RunFile
 from .scene import Trails, checked_target, colored_points, nanoseconds
 
+__all__ = ["RerunSink"]
+
 # The SDK writes in a thread of its own and waits for ever if that has failed, so it writes to a pipe. Where there is
 # none, space is checked beforehand: a point takes 20 bytes; the rest of a scan less than 8 MB.
 _HAS_PIPES = hasattr(os, "mkfifo")

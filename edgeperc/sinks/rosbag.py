@@ -17,6 +17,8 @@ from ..system.atomic import beside
 from ..system.extras import require
 from .run_file import settle
 
+__all__ = ["TOPICS", "BagSink"]
+
 TOPICS = {name: "/diagnostics" if name == "diagnostics" else f"/edgeperc/{name}" for name in OUTPUTS}
 """The topic of each message of `edgeperc.ros2.messages.OUTPUTS`."""
 

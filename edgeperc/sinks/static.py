@@ -16,6 +16,8 @@ from ..tracking.moving import movable_points, moving_points
 from ..types.points import Floats32, Mask, as_points
 from .run_file import ScanFiles, stem_of
 
+__all__ = ["StaticSink"]
+
 _FIELDS = ("x", "y", "z", "intensity")
 
 

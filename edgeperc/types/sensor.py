@@ -20,6 +20,16 @@ from ..system.names import check_text, nearest
 from .choices import AUTO_SENSOR
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 
+__all__ = [
+    "PUBLIC_SENSORS",
+    "REMISSION_KINDS",
+    "SENSORS",
+    "RemissionFunction",
+    "ScanPattern",
+    "SensorProfile",
+    "get_sensor",
+]
+
 SCHEMA = 2  # of a sensor profile's file
 # Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
 # sensors measure from 0.05 to 1 m on.
