@@ -171,6 +171,13 @@ def test_a_blocked_sector_is_found_in_its_first_scan(sensor: str, left: float, r
     assert health.blocked > 0.05
 
 
+def test_the_sentence_names_the_sector() -> None:
+    health, _ = check_health(weather.dirty(clear(3), 60.0, 20.0), HDL, Normal())
+    assert "from 20 degrees left to 60 degrees left" in health.findings[0]
+    health, _ = check_health(weather.dirty(clear(3), 30.0, -20.0), HDL, Normal())
+    assert "from 20 degrees right to 30 degrees left" in health.findings[0]
+
+
 @pytest.mark.parametrize("width_deg", [12.0, 30.0, 90.0])
 def test_a_window_that_gets_dirty_is_found_and_what_was_always_hidden_is_not(width_deg: float) -> None:
     dirty = [weather.dirty(clear(seed), 60.0, 60.0 - width_deg) for seed in range(20, 26)]

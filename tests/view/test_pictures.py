@@ -246,9 +246,17 @@ def test_points_of_unknown_remission_are_drawn(scan: np.ndarray, perception: Per
     assert flatten_scan(known, perception) == flatten_scan(unknown, perception)
 
 
-def test_a_class_adds_no_line_to_the_header_of_a_ply(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
-    classes = (*POINT_CLASSES[:3], "tram\nelement vertex 3")
+@pytest.mark.usefixtures("matplotlib")
+def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
+    strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
+    classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
     perception = replace(perception, points=replace(perception.points, classes=classes))
+    assert pixels(view.draw(perception, scan, title=strange)).shape[1] == 1600
+    write_html(perception, scan, tmp_path / "page.html", title=strange)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert text.count("<script") == 2
+    assert text.count("</script>") == 2
+    assert "&lt;script&gt;alert(1)" in text
     write_ply(perception, scan, tmp_path / "points.ply")
     header = (tmp_path / "points.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     assert [line for line in header if line.startswith("element")] == [f"element vertex {len(scan)}"]
