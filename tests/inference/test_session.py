@@ -20,7 +20,6 @@ from edgeperc import errors
 from edgeperc.inference import providers
 from edgeperc.inference.providers import PROVIDERS, available_providers
 from edgeperc.inference.session import Session, golden_input
-from edgeperc.system import machine
 from edgeperc.system.machine import fingerprint, settings_path, write_settings
 from edgeperc.types.card import CARD_KEY
 from edgeperc.zoo import Variant, digest, listed, model_path, resolve
@@ -242,12 +241,12 @@ def test_a_precision_picks_the_variant(precision: str) -> None:
 
 
 def test_auto_takes_int8_where_it_is_native(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "cpu_features", lambda: frozenset({"avx512_vnni"}))
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx512_vnni"}))
     assert Session("pointseg", "cpu").description == "pointseg int8, CPUExecutionProvider"
     assert Session("pointseg", "cpu", precision="fp32").description == "pointseg fp32, CPUExecutionProvider"
-    monkeypatch.setattr(machine, "cpu_features", lambda: frozenset({"avx2"}))
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx2"}))
     assert Session("pointseg", "cpu").description == "pointseg int8, CPUExecutionProvider"  # its weights have 7 bits
-    monkeypatch.setattr(machine, "cpu_features", lambda: frozenset({"sse4_2"}))
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"sse4_2"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
 
 
@@ -255,10 +254,10 @@ def test_auto_skips_a_provider_that_cannot_run_the_model(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # A provider that is said to be there, and that no onnxruntime can make active.
-    monkeypatch.setattr(providers, "PROVIDERS", {"mirage": "MirageExecutionProvider", **PROVIDERS})
-    monkeypatch.setattr(providers, "AUTO", ("mirage", "cpu"))
-    monkeypatch.setattr(providers, "available_providers", lambda: ("mirage", "cpu"))
-    monkeypatch.setattr(providers, "is_available", lambda _: True)
+    monkeypatch.setattr(session_module, "PROVIDERS", {"mirage": "MirageExecutionProvider", **PROVIDERS})
+    monkeypatch.setattr(session_module, "AUTO", ("mirage", "cpu"))
+    monkeypatch.setattr(session_module, "available_providers", lambda: ("mirage", "cpu"))
+    monkeypatch.setattr(session_module, "is_available", lambda _: True)
     assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider"
     assert "auto skips pointseg on mirage in fp32" in caplog.text
     with pytest.raises(errors.ProviderError):
@@ -281,7 +280,7 @@ class FakePlugins:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, devices: Sequence[tuple[str, str]]) -> None:
         self.libraries: list[str] = []
         self.chosen: list[tuple[str, dict[str, str]]] = []
-        self.ort = ort = providers.load_onnxruntime()
+        self.ort = ort = session_module.load_onnxruntime()
         fakes = [
             SimpleNamespace(ep_name=name, device=SimpleNamespace(type=SimpleNamespace(name=kind)))
             for name, kind in devices
@@ -329,8 +328,9 @@ class FakePlugins:
                 assert name in {device.ep_name for device in fakes}
                 plugins.libraries.append(library)
 
-        monkeypatch.setattr(providers, "load_onnxruntime", Ort)
-        for short, package in providers.PLUGINS.items():
+        for module in (providers, session_module):
+            monkeypatch.setattr(module, "load_onnxruntime", Ort)
+        for short, package in session_module.PLUGINS.items():
             offered = PROVIDERS[short] in {name for name, _ in devices}
             fake = SimpleNamespace(get_library_path=lambda package=package: f"{package}.so") if offered else None
             monkeypatch.setitem(sys.modules, package, fake)  # None: it cannot be imported
@@ -341,7 +341,7 @@ def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) 
     fake = FakePlugins(monkeypatch, [(name, "CPU"), (name, "GPU"), (name, "NPU")])
     assert available_providers() == ("qnn", "cpu")
     assert fake.libraries == ["onnxruntime_qnn.so"]
-    monkeypatch.setattr(machine, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
     assert Session("pointseg", "qnn").description == f"pointseg int8, {name}"
     assert fake.chosen == [("NPU", {"htp_performance_mode": "burst"})]
     assert Session("pointseg", "qnn", precision="fp32").precision == "fp32"
@@ -431,7 +431,7 @@ def test_auto_skips_a_provider_that_gives_other_outputs(
         return warm_up(self, limit, run_options)
 
     monkeypatch.setattr(Session, "warm_up", wrong)
-    monkeypatch.setattr(machine, "cpu_features", lambda: frozenset({"avx512_vnni"}))
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx512_vnni"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
     assert "auto skips pointseg on cpu in int8: off by far" in caplog.text
     with pytest.raises(errors.CardMismatchError, match="off by far"):
@@ -458,7 +458,7 @@ def test_auto_takes_the_setting_that_was_measured_here(
     keep({sha: {"provider": "qnn", "precision": "fp32", "n_threads": 1}})
     assert Session(path, "auto").options["threads"] == "the provider's choice"
     assert "pointseg on qnn, which was measured as the fastest: it is no longer available" in caplog.text
-    monkeypatch.setattr(machine, "cpu_features", frozenset)
+    monkeypatch.setattr(session_module, "cpu_features", frozenset)
     keep({digest(resolve("pointseg")): {"provider": "cpu", "precision": "int8", "n_threads": 1}})
     assert Session("pointseg").precision == "int8"  # though nothing is known of the processor
     assert Session("pointseg", precision="fp32").options["threads"] == "the provider's choice"
