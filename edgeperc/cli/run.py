@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import sys
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
 
 
 _KINDS = ("png", "html", "labels", "ply")
+_BETWEEN_DRIVES_S = 100.0  # more than the 60 s over which a tracker remembers its tracks
 _NUMBERED = re.compile(r"\d{6,}\.bin")  # the file of ``--static`` of a scan in a capture
 
 
@@ -175,8 +177,8 @@ def add_parser(commands: Commands) -> None:
     tracking = options(parser, "tracking")
     tracking(
         "--track",
-        "track the boxes from scan to scan; the scans must be one drive, in order. Late scans have no tracks, and "
-        "after a jump of the clock tracking begins anew",
+        "track the boxes from scan to scan, in their order; each folder of scan files is a drive. Late scans have no "
+        "tracks, and after a jump of the clock, or for another drive, tracking begins anew",
     )
     tracking("--gif", "write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'")
     live = options(parser, "live")
@@ -512,6 +514,7 @@ class _Run:
 
             self._straightener = Straightener(_trajectory(arguments))
         self._n = 0
+        self._folder: Path | Remote | None = None
         self._first_place: tuple[float, float, float] | None = None
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
@@ -536,6 +539,7 @@ class _Run:
                     stacklevel=2,
                 )
             if not numbered:
+                self._enter(shown.parent)
                 how["origin_m"] = self._origin(path)
             for k, (stamp_s, points, *times_s) in enumerate(read(path, **how)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
@@ -556,6 +560,18 @@ class _Run:
             self._n += not numbered  # a scan that cannot be read takes its time, too
             yield shown, exc, None, None
 
+    def _enter(self, folder: Path | Remote) -> None:
+        """Tell drives apart: in files without times, the next folder's scans would continue the tracks of the last."""
+        if self._tracker is not None and self._folder not in (None, folder):
+            warnings.warn(
+                f"--track: {folder} is taken for another drive than {self._folder}: its scans count as "
+                f"{_BETWEEN_DRIVES_S:g} s later, and tracking begins anew, with new ids; put scans of one drive into "
+                "one folder",
+                stacklevel=2,
+            )
+            self._n += math.ceil(_BETWEEN_DRIVES_S * self._arguments.rate)
+        self._folder = folder
+
     def _origin(self, scan: Path) -> Sequence[float] | None:
         """Place of the sensor in the map of a scan file, as ``--origin`` says."""
         from ..readers.files import find_origin
@@ -570,7 +586,9 @@ class _Run:
         from ..readers.images import read_image
         from ..sinks.prelabels import calibration_of
 
-        arguments, perceivers, at_s = self._arguments, self._perceivers, self._at_s(None)
+        arguments, perceivers = self._arguments, self._perceivers
+        self._enter((scan or path).parent)
+        at_s = self._at_s(None)
         try:
             image = read_image(path)
             perceive = perceivers.of(perceivers.sensor_of(scan) if scan else stated_sensor(arguments))

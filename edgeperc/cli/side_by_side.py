@@ -240,8 +240,8 @@ class _ScanWorker:
             return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
         answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)
         if files:
-            sizes = {file.name: stamp[0] for file in files if (stamp := _stamp(file)) is not None}
-            content = json.dumps({"made_of": made_of, "files": sizes, "answer": astuple(answer)}).encode()
+            written = {"made_of": made_of, "files": _stamps(files), "answer": astuple(answer)}
+            content = json.dumps(written).encode()
             if isinstance(record, Path):
                 record.parent.mkdir(parents=True, exist_ok=True)
                 write_atomic(record, content)
@@ -254,15 +254,18 @@ def _kept(record: Path | Remote, made_of: str, files: Sequence[Path | Remote]) -
     """The answer of an earlier run, if it was made of the same and its files are complete."""
     try:
         content = json.loads(record.read_bytes())
-        if content["made_of"] != made_of:
-            return None
-        stamps = {file.name: _stamp(file) for file in files}
-        if any(stamp is None or stamp[0] != content["files"][name] for name, stamp in stamps.items()):
+        # A run in one process, or one that was stopped, may have replaced files by others of the same size.
+        if content["made_of"] != made_of or content["files"] != _stamps(files):
             return None
         text, error, fitness, warned, _ = content["answer"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):
         return None
     return _Answer(text, error, tuple(fitness), tuple(warned), kept=True)
+
+
+def _stamps(files: Sequence[Path | Remote]) -> dict[str, list[int | str] | None]:
+    """`_stamp` of each file by its name, as JSON has it."""
+    return {file.name: (stamp := _stamp(file)) and [*stamp] for file in files}
 
 
 def _stamp(file: Path | Remote) -> tuple[int, str] | None:

@@ -30,6 +30,7 @@ KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
 
 _CLASSES = (*VEHICLES, "pedestrian", "cyclist")
 _COLORS = ("#4363d8", "#42d4f4", "#f58231", "#e6194b", "#3cb44b", "#911eb4", "#f032e6", "#bfef45", "#9a6324", "#808000")
+_FORM = "centroid_rel"  # of labelCloud: angles in radians
 _SUSTECH_CLASSES = {"cyclist": "BicycleRider"}  # the others have their own names, with a capital
 
 # The camera that KITTI's format needs, where no calibration is given: at the sensor, looking ahead, with the lens of
@@ -49,7 +50,7 @@ class PrelabelSink:
     With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
     the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
     place there is known (``origin_m``); KITTI's are in the frame of the camera. A scan without boxes gets an empty
-    file.
+    file. Labels that differ from those in the folder do not replace them: they may be corrected, or the truth.
 
     - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
@@ -73,7 +74,8 @@ class PrelabelSink:
     Raises
     ------
     OptionError
-        ``kind`` is unknown, or ``calib`` is given for another format than KITTI's.
+        ``kind`` is unknown, ``calib`` is given for another format than KITTI's, or ``labels/_classes.json`` is
+        there with another format.
     OSError
         The folder cannot be made.
     """
@@ -94,6 +96,8 @@ class PrelabelSink:
         self._files, self._classes = ScanFiles(), [*_CLASSES]
         self._stack = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
+        settings = self._folder / "labels/_classes.json"
+        self._known = _known_classes(settings) if kind == "labelcloud" and settings.exists() else []
         if kind == "cvat":
             self._before: Mapping[int, Box] = {}
             self._n_items = 0
@@ -118,10 +122,11 @@ class PrelabelSink:
     def close(self, whole: bool = True) -> None:
         """Finish the files that are of all scans; see `Sink.close`."""
         if self._kind == "labelcloud":
-            classes = [
-                {"name": name, "id": k, "color": _COLORS[k % len(_COLORS)]} for k, name in enumerate(self._classes)
-            ]
-            document = {"classes": classes, "default": 0, "type": "object_detection", "format": "centroid_rel"}
+            known = [each["name"] for each in self._known]
+            first = 1 + max((each["id"] for each in self._known), default=-1)
+            new = enumerate((name for name in self._classes if name not in known), start=first)
+            classes = [*self._known, *({"name": name, "id": k, "color": _COLORS[k % len(_COLORS)]} for k, name in new)]
+            document = {"classes": classes, "default": classes[0]["id"], "type": "object_detection", "format": _FORM}
             name = Path("labels/_classes.json")
             self._write_json(str(name if whole else part_of(name)), "", document)
             if not whole:
@@ -201,8 +206,8 @@ class PrelabelSink:
             rows["Tr_imu_to_velo"] = np.eye(4)[:3]
             text = "".join(f"{key}: {' '.join(f'{v:.6e}' for v in row.ravel())}\n" for key, row in rows.items())
         lines = [_kitti_line(box, T_cam_sensor, P2, size) for box, _ in boxes]
+        self._write(f"calib/{name}.txt", scan.name, text.encode())  # first: labels are nothing without their camera
         self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
-        self._write(f"calib/{name}.txt", scan.name, text.encode())
 
     def _write_json(self, name: str, scan: str, document: Any) -> None:
         self._write(name, scan, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
@@ -210,7 +215,25 @@ class PrelabelSink:
     def _write(self, name: str, scan: str, content: bytes) -> None:
         target = self._files.checked(self._folder / name, scan)
         target.parent.mkdir(exist_ok=True)
+        if scan and target.exists() and target.read_bytes() != content:  # hours of work may be in it
+            raise OptionError(
+                f"{target} exists with other content, perhaps corrected by hand, and stays; choose another folder, or "
+                "delete it"
+            )
         write_atomic(target, content)
+
+
+def _known_classes(path: Path) -> list[dict[str, Any]]:
+    """The classes of labels that are there, in the form of those to write. Raises OptionError."""
+    try:
+        document = json.loads(path.read_text("utf-8-sig"))
+        form = document["format"]
+        classes = [{**each, "name": str(each["name"]), "id": int(each["id"])} for each in document["classes"]]
+    except (KeyError, TypeError, ValueError) as exc:
+        raise OptionError(f"{path} holds no classes of labelCloud ({exc!r:.99}); choose another folder") from exc
+    if form != _FORM:
+        raise OptionError(f"{path} has format {form!r:.40}, and {_FORM} would be written; choose another folder")
+    return classes
 
 
 def calibration_of(calib: Path, scan: str) -> Path:

@@ -638,8 +638,8 @@ def test_a_scan_that_cannot_be_read_costs_no_other_scan(tmp_path: Path, shell: S
     assert f"{tmp_path / 'b.bin'}: the file cannot be read" in err
 
 
-def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without it, what moves had twice its speed behind the gap."""
+def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
+    """Without it, what moves had twice its speed behind the gap. The next folder's scans continue no track."""
     stamps_s = []
     update = Tracker.update
     monkeypatch.setattr(Tracker, "update", lambda self, *a, **k: (stamps_s.append(a[1]), update(self, *a, **k))[1])
@@ -648,8 +648,10 @@ def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "1.bin").write_bytes(b"\0" * 17)  # cannot be read
     (tmp_path / "3.bin").unlink()
     (tmp_path / "3.bin").symlink_to("nowhere")
-    assert run("run", tmp_path, "--track") == 1
-    assert stamps_s[-3:] == pytest.approx([0.1, 0.3, 0.5])  # before them, those of a warm-up
+    (tmp_path / "next").mkdir()
+    write_scan(tmp_path / "next/0.bin")
+    assert "another drive" in shell.err("run", tmp_path, tmp_path / "next", "--track", code=1)
+    assert stamps_s[-4:] == pytest.approx([0.1, 0.3, 0.5, 100.6])  # before them, those of a warm-up
 
 
 def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(tmp_path: Path, shell: Shell) -> None:

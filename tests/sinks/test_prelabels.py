@@ -8,6 +8,7 @@ import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from tempfile import mkdtemp
 from types import SimpleNamespace
 from typing import Any
 
@@ -229,7 +230,7 @@ def training_folder(folder: Path, kind: str, *names: str) -> ScanFolder:
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(ANY_BOXES)
 def test_boxes_come_back_for_training(tmp_path: Path, kind: str, boxes: list[Box]) -> None:
-    folder = written(tmp_path, kind, perceived("000003.bin", tuple(boxes)))
+    folder = written(Path(mkdtemp(dir=tmp_path)), kind, perceived("000003.bin", tuple(boxes)))
     frame = training_folder(folder, kind, "000003").frame("000003")
     check_rows(rows_of(frame.boxes), rows_of(boxes))
 
@@ -311,7 +312,7 @@ def test_boxes_of_kitti_are_cut_to_the_image_that_was_perceived(tmp_path: Path) 
     _, top, _, bottom = map(float, (folder / "label_2/a.txt").read_text().split()[4:8])
     assert top < 600.0 + 707.0 * 0.85 / 14.0 < bottom
     with pytest.warns(UserWarning, match="center at 960, 600, far from the middle of the image of 1242 x 375"):
-        written(tmp_path, "kitti", scan, calib=calib)
+        written(tmp_path / "other", "kitti", scan, calib=calib)
 
 
 def test_errors_name_the_reason(tmp_path: Path) -> None:
@@ -327,7 +328,33 @@ def test_errors_name_the_reason(tmp_path: Path) -> None:
         sink.close()
         sink.close()
         assert not [*(tmp_path / kind).glob(".*")]
-        assert len(READERS[kind](written(tmp_path / kind, kind, perceived("x.bin")), "x")) == len(BOXES)
+        assert len(READERS[kind](written(tmp_path / kind, kind, perceived("a/x.bin")), "x")) == len(BOXES)
+
+
+@pytest.mark.parametrize("file", ["labels/x.json", "label/x.json", "label_2/x.txt", "calib/x.txt"])
+def test_labels_that_are_there_stay(tmp_path: Path, file: str) -> None:
+    """They may be corrected by hand, or the truth of the data set."""
+    kind = {"labels": "labelcloud", "label": "sustechpoints"}.get(file.split("/")[0], "kitti")
+    written(tmp_path, kind, perceived("x.bin"))
+    (tmp_path / file).write_text("corrected")
+    with pytest.raises(OptionError, match="perhaps corrected by hand"):
+        written(tmp_path, kind, perceived("x.bin"))
+    assert (tmp_path / file).read_text() == "corrected"
+
+
+def test_classes_of_labelcloud_that_are_there_stay(tmp_path: Path) -> None:
+    path = written(tmp_path, "labelcloud", perceived("x.bin")) / "labels/_classes.json"
+    document = json.loads(path.read_text())
+    document["classes"] = [{"name": "tram", "id": 7, "color": "#000000"}, *document["classes"][:2]]
+    path.write_text(json.dumps(document))
+    written(tmp_path, "labelcloud", perceived("y.bin"))
+    classes = json.loads(path.read_text())["classes"]
+    assert classes[:3] == document["classes"]
+    assert [(each["name"], each["id"]) for each in classes[3:5]] == [("truck", 8), ("pedestrian", 9)]
+    for text, reason in (("centroid_abs", "centroid_rel would be written"), ('"format', "no classes of labelCloud")):
+        path.write_text(json.dumps(document).replace("centroid_rel", text) if text[0] != '"' else text)
+        with pytest.raises(OptionError, match=reason):
+            PrelabelSink(tmp_path, "labelcloud")
 
 
 def test_degrees_of_labelcloud_are_read_by_its_file_of_classes(tmp_path: Path) -> None:

@@ -146,6 +146,11 @@ def test_what_workers_have_made_is_kept(scans: Path, alone: Any, here: None, tmp
     _, others, said = run(*arguments, "--boxes-from", "network")
     assert "kept" not in said
     assert others != records
+    run(*arguments)
+    before = contents(tmp_path)
+    run(*arguments[:-2], "--no-agreement")  # one process replaces files by others of the same size
+    run(*arguments)
+    assert contents(tmp_path) == before
     profile = tmp_path / "sensor.json"
     for ego_box in (None, ((-9.0, 9.0), (-9.0, 9.0), (-1.0, 2.0))):
         profile.write_text(replace(get_sensor("hdl-64e"), ego_box=ego_box).to_json())
