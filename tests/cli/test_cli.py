@@ -638,6 +638,7 @@ def test_a_scan_that_cannot_be_read_costs_no_other_scan(tmp_path: Path, shell: S
     assert f"{tmp_path / 'b.bin'}: the file cannot be read" in err
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
     """Without it, what moves had twice its speed behind the gap. The next folder's scans continue no track."""
     stamps_s = []
