@@ -661,7 +661,14 @@ class _Run:
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
         try:
-            _write(points, perception, wanted, title=source)
+            if "png" in wanted:
+                view.draw(perception, points, wanted["png"], title=source)
+            if "html" in wanted:
+                view.write_html(perception, points, wanted["html"], title=source)
+            if "labels" in wanted:
+                view.write_labels(perception, wanted["labels"])
+            if "ply" in wanted:
+                view.write_ply(perception, points, wanted["ply"])
         finally:  # a picture that cannot be written costs no sink its scan
             self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
         under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
@@ -727,16 +734,3 @@ def _files_of(arguments: argparse.Namespace, target: Path, kinds: Sequence[str],
         if arguments.calib is not None:
             files["both"] = target.with_name(f"{target.name}_both.png")
     return files
-
-
-def _write(points: Points, perception: Perception, wanted: Mapping[str, Path], title: str) -> None:
-    from .. import view
-
-    if "png" in wanted:
-        view.draw(perception, points, wanted["png"], title=title)
-    if "html" in wanted:
-        view.write_html(perception, points, wanted["html"], title=title)
-    if "labels" in wanted:
-        view.write_labels(perception, wanted["labels"])
-    if "ply" in wanted:
-        view.write_ply(perception, points, wanted["ply"])

@@ -81,23 +81,20 @@ class PrelabelSink:
     """
 
     def __init__(self, folder: str | Path, kind: str, *, calib: str | Path | None = None) -> None:
-        writers: dict[str, Callable[[str, PerceivedScan, Sequence[Named]], None]] = {
-            "labelcloud": self._labelcloud,
-            "cvat": self._cvat,
-            "kitti": self._kitti,
-            "sustechpoints": self._sustechpoints,
-        }
-        if kind not in writers:
+        if kind not in KINDS:
             raise OptionError(f"no labels are known for {kind!r}; expected one of {', '.join(KINDS)}")
         if calib is not None and kind != "kitti":
             raise OptionError(f"labels for {kind} need no calibration; leave it out, or choose kitti")
-        self._folder, self._kind, self._writer = Path(folder), kind, writers[kind]
+        self._folder, self._kind = Path(folder), kind
+        self._writer: Callable[[str, PerceivedScan, Sequence[Named]], None] = getattr(self, f"_{kind}")
         self._calib = None if calib is None else Path(calib)
-        self._files, self._classes = ScanFiles(), [*_CLASSES]
+        self._files = ScanFiles()
         self._stack = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         settings = self._folder / "labels/_classes.json"
-        self._known = _known_classes(settings) if kind == "labelcloud" and settings.exists() else []
+        self._classes = _known_classes(settings) if kind == "labelcloud" and settings.exists() else {}
+        for name in _CLASSES:
+            self._number(name)
         if kind == "cvat":
             self._before: Mapping[int, Box] = {}
             self._n_items = 0
@@ -115,17 +112,13 @@ class PrelabelSink:
             placed = scan.perception.in_map(box for box, _ in boxes)
             boxes = [(box, number) for box, (_, number) in zip(placed, boxes, strict=True)]
         for box, _ in boxes:
-            if box.label not in self._classes:
-                self._classes.append(box.label)
+            self._number(box.label)
         self._writer(stem_of(scan.name)[0], scan, boxes)
 
     def close(self, whole: bool = True) -> None:
         """Finish the files that are of all scans; see `Sink.close`."""
         if self._kind == "labelcloud":
-            known = [each["name"] for each in self._known]
-            first = 1 + max((each["id"] for each in self._known), default=-1)
-            new = enumerate((name for name in self._classes if name not in known), start=first)
-            classes = [*self._known, *({"name": name, "id": k, "color": _COLORS[k % len(_COLORS)]} for k, name in new)]
+            classes = [*self._classes.values()]
             document = {"classes": classes, "default": classes[0]["id"], "type": "object_detection", "format": _FORM}
             name = Path("labels/_classes.json")
             self._write_json(str(name if whole else part_of(name)), "", document)
@@ -137,6 +130,12 @@ class PrelabelSink:
             self._document.write(f'], "categories": {json.dumps(categories)}}}'.encode())
             self._stack.close()
             self._file.close(whole)
+
+    def _number(self, name: str) -> int:
+        """The number of a class, which is new if nobody has named it."""
+        new = 1 + max((each["id"] for each in self._classes.values()), default=-1)
+        entry = {"name": name, "id": new, "color": _COLORS[new % len(_COLORS)]}
+        return int(self._classes.setdefault(name, entry)["id"])
 
     def _labelcloud(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         source = Path(scan.name)
@@ -183,7 +182,7 @@ class PrelabelSink:
                     "type": "cuboid_3d",
                     "attributes": attributes,
                     "group": 0,
-                    "label_id": self._classes.index(box.label),
+                    "label_id": self._number(box.label),
                     **cvat_cuboid(box),
                 }
             )
@@ -223,12 +222,14 @@ class PrelabelSink:
         write_atomic(target, content)
 
 
-def _known_classes(path: Path) -> list[dict[str, Any]]:
-    """The classes of labels that are there, in the form of those to write. Raises OptionError."""
+def _known_classes(path: Path) -> dict[str, dict[str, Any]]:
+    """The classes of labels that are there, by name, if they have the form of those to write. Raises OptionError."""
     try:
         document = json.loads(path.read_text("utf-8-sig"))
-        form = document["format"]
-        classes = [{**each, "name": str(each["name"]), "id": int(each["id"])} for each in document["classes"]]
+        form, classes = (
+            document["format"],
+            {each["name"]: {**each, "id": int(each["id"])} for each in document["classes"]},
+        )
     except (KeyError, TypeError, ValueError) as exc:
         raise OptionError(f"{path} holds no classes of labelCloud ({exc!r:.99}); choose another folder") from exc
     if form != _FORM:

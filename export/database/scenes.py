@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edgeperc import Perceiver
+from edgeperc import Perceiver, __version__
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.preprocess.condition import condition
@@ -199,7 +199,7 @@ class SceneBuilder:
     def _key(self, job: Job, model: dict[str, str]) -> str:
         """A hash of everything that decides a scene's files."""
         facts = [
-            FORMAT, model, asdict(self.sensor), self.plan.variations, job.name, job.split, job.road,
+            FORMAT, __version__, model, asdict(self.sensor), self.plan.variations, job.name, job.split, job.road,
             inputs_of(self.plan.kitti, job.name),
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -542,7 +542,7 @@ def test_a_broken_scene_is_left_out_and_reported(
 
 
 def test_changed_scenes_are_made_again_and_removed_ones_deleted(
-    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path
+    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "kitti"
     shutil.copytree(kitti, root)
@@ -567,6 +567,8 @@ def test_changed_scenes_are_made_again_and_removed_ones_deleted(
     assert build(plan, workers=1).made == 2  # no polygons: these scenes take the road of the model
     assert not [*(plan.out / "road/masks").iterdir()]
     other = road_network(tmp_path / "other.onnx", VIEW)
+    assert build(replace(plan, road_by=str(other)), workers=1).made == 7
+    monkeypatch.setattr(scenes_module, "__version__", "0")
     assert build(replace(plan, road_by=str(other)), workers=1).made == 7
 
 
