@@ -225,8 +225,14 @@ def run_command(arguments: argparse.Namespace) -> int:
     _check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
-    if kinds and isinstance(arguments.out, Path):
-        _make_folders(arguments.out, targets)
+    for folder in {target.parent for target in targets if kinds and isinstance(target, Path)}:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as exc:
+            raise OptionError(
+                f"--out {arguments.out}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a "
+                "name that is free in one that can be written"
+            ) from exc
     report = Report(arguments, images)
     for folder in found.empty:
         has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
@@ -375,17 +381,6 @@ def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures
             f"{min(replaced)} is one of the scans and would be overwritten by --static with another one; choose "
             "another folder"
         )
-
-
-def _make_folders(out: Path, targets: Sequence[Path]) -> None:
-    for folder in {target.parent for target in targets}:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as exc:
-            raise OptionError(
-                f"--out {out}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a name that "
-                "is free in one that can be written"
-            ) from exc
 
 
 def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
