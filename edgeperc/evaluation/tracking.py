@@ -264,12 +264,6 @@ def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSE
     return results
 
 
-def _frame_truth(sequence: TrackingSequence, label: str, rules: str) -> Sequence[FrameTruth]:
-    """True boxes of one class for the metrics, by frame."""
-    truth, in_camera = sequence.truth[label], sequence.calibration.in_camera
-    return truth if rules != "ab3dmot" else [replace(frame, boxes=in_camera(frame.boxes)) for frame in truth]
-
-
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
     """Convert the tracks of one class for the metrics, by frame."""
     frames = []
@@ -364,7 +358,9 @@ def evaluate_kitti(
         if rival:
             results["ab3dmot"] = ab3dmot_sequence(sequence, classes)
         for label in classes:
-            true = _frame_truth(sequence, label, rules)
+            true: Sequence[FrameTruth] = sequence.truth[label]
+            if rules == "ab3dmot":
+                true = [replace(frame, boxes=sequence.calibration.in_camera(frame.boxes)) for frame in true]
             for method, reported in results.items():
                 pair = true, _frame_tracks(sequence, reported, label, rules)
                 pairs.setdefault((method, label), []).append(pair)

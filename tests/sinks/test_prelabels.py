@@ -149,8 +149,7 @@ READERS = {
     "sustechpoints": read_as_sustechpoints,
 }
 NAMES = {
-    "labelcloud": ("car", "pedestrian", "cyclist", "forklift truck"),
-    "cvat": ("car", "pedestrian", "cyclist", "forklift truck"),
+    **dict.fromkeys(("labelcloud", "cvat"), ("car", "pedestrian", "cyclist", "forklift truck")),
     "kitti": ("Car", "Pedestrian", "Cyclist", "Forklift_truck"),
     "sustechpoints": ("Car", "Pedestrian", "BicycleRider", "Forklift_truck"),
 }
