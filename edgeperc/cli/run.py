@@ -510,6 +510,7 @@ class _Run:
             self._straightener = Straightener(_trajectory(arguments))
         self._n = 0
         self._folder: Path | Remote | None = None
+        self._n_before = 0  # scans, where the folder began
         self._first_place: tuple[float, float, float] | None = None
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
@@ -556,8 +557,12 @@ class _Run:
             yield shown, exc, None, None
 
     def _enter(self, folder: Path | Remote) -> None:
-        """Tell drives apart: in files without times, the next folder's scans would continue the tracks of the last."""
-        if self._tracker is not None and self._folder not in (None, folder):
+        """Tell drives apart: in files without times, the next folder's scans would continue the tracks of the last. A
+        folder of one scan is none: some sets have a folder for each scan.
+        """
+        if folder == self._folder:
+            return
+        if self._tracker is not None and self._folder is not None and self._n > self._n_before + 1:
             warnings.warn(
                 f"--track: {folder} is taken for another drive than {self._folder}: its scans count as "
                 f"{_BETWEEN_DRIVES_S:g} s later, and tracking begins anew, with new ids; put scans of one drive into "
@@ -565,7 +570,7 @@ class _Run:
                 stacklevel=2,
             )
             self._n += math.ceil(_BETWEEN_DRIVES_S * self._arguments.rate)
-        self._folder = folder
+        self._folder, self._n_before = folder, self._n
 
     def _origin(self, scan: Path) -> Sequence[float] | None:
         """Place of the sensor in the map of a scan file, as ``--origin`` says."""
