@@ -38,8 +38,8 @@ from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Stopwatch, Values
-from .types.frame import turned
-from .types.mounting import MODEL_HEIGHT_M, Mounting
+from .types.frame import ModelFrame, turned
+from .types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.points import Bytes, Heights, Ids, Ints, Points, Rows
 from .types.sensor import SensorProfile
@@ -97,16 +97,16 @@ class TopViewNetwork:
         self.session, self.card, self.view = session, session.card, view
         self.projector = make_projector(view, session.card.input)
         self.index = np.empty((view.height, view.width), np.int32)
-        self._observer = Observer(view, sensor)
+        self._frame, self._observer = _training_frame(session), Observer(view, sensor)
 
     def project(self, near: View) -> None:
         """Write the points into the network's input (SSADNet 2.1.2)."""
         pixel = np.empty(len(near.points), np.int32)
-        self.projector.fill(near.points, self.session.input, self.index, pixel, None)
+        self.projector.fill(self._frame.move_back(near.points), self.session.input, self.index, pixel, None)
 
-    def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> list[Box]:
+    def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> Sequence[Box]:
         """Run the network on what was projected, and decode its boxes (SSADNet 3.1); weak ones without a class."""
-        return decode_boxes(self.card, self.session.run(), score_threshold, named_from)
+        return self._frame.move_boxes(decode_boxes(self.card, self.session.run(), score_threshold, named_from))
 
     def label_cells(self, near: View, boxes: Sequence[Box], mounting: Mounting) -> TopView:
         """Class of every cell, and which cells the scan observed; after `find_boxes`."""
@@ -127,6 +127,7 @@ class RangeImageNetwork:
         self.session, self.card, self.view, self.interpolator = session, session.card, view, interpolator
         self.projector = make_projector(view, session.card.input)
         self.index = np.empty((view.height, view.width), np.int32)
+        self._frame = _training_frame(session)
         self._edges_meet = view.azimuth_left_deg - view.azimuth_right_deg == 360.0
 
     def second(self) -> RangeImageNetwork:
@@ -135,6 +136,7 @@ class RangeImageNetwork:
 
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         """Project points, run the network, decode pixels, remove outliers and label the points (PointSeg 3.1, 3.4)."""
+        points = self._frame.move_back(points)
         pixel = np.empty(len(points), np.int32)
         if self.interpolator is None:
             self.projector.fill(points, self.session.input, self.index, pixel, height_m)
@@ -145,7 +147,8 @@ class RangeImageNetwork:
             # Interpolated points are in the image only; refinement uses the points of the scan. The ground is found
             # anew below them: with heights between those of their neighbors, IoU of cars is up to 1.9 points lower.
             dense, filled = self.interpolator.fill(points, self.index)
-            self.projector.fill_image(dense, filled, self.session.input, input_heights(self.projector, dense))
+            heights = input_heights(self.projector, self._frame.move(dense))
+            self.projector.fill_image(dense, filled, self.session.input, heights)
             watch.lap("adapt")
         ((kind, raw),) = self.session.run().items()
         watch.lap("infer")
@@ -315,6 +318,11 @@ class Pipeline:
         if self.top is not None:
             objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
+
+
+def _training_frame(session: Session) -> ModelFrame:
+    """Where a network's training points lie: as of the models' vehicle, but for the height in the card."""
+    return ModelFrame(replace(MODEL_MOUNTING, height_m=session.card.mount_height_m))
 
 
 def _absent() -> None:

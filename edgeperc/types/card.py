@@ -193,7 +193,7 @@ class ModelCard:
     score_threshold, nms_iou : float
         Defaults for boxes.
     mount_height_m : float
-        Height of the training sensor above the road [m].
+        Height of the training sensor above the road [m]: scans are moved there before the network sees them.
     fitness : mapping or None
         Statistics of the training scans (`edgeperc.preprocess.fitness.FitnessProfile`); None if they were not measured.
     training : mapping

@@ -1,15 +1,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+import tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.projection
+from edgeperc import Mounting, Perceiver
 from edgeperc.errors import CardError, PointsError
 from edgeperc.ground.planes import find_ground
 from edgeperc.inference import projection
@@ -19,6 +23,7 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc_bench.peers.projection import contenders
 
+GRAPH = tiny_model.graph(tiny_model.CONVOLUTION, tiny_model.INITIALIZER)
 UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)
 HDL_64E = tuple(2.0 - k / 3.0 for k in range(32)) + tuple(-8.83 - k / 2.0 for k in range(32))
 # More pixels than 16 bits count; interpreted, so many take half of the time of all projections.
@@ -396,3 +401,19 @@ def test_wrong_cards_are_refused() -> None:
             make_projector(view, spec)
     with pytest.raises(CardError, match="at least 1 degree apart"):
         RangeImageGeometry((1.0, -1.0), 4, 45.0 + 1e-9, 45.0)
+
+
+@pytest.mark.parametrize("view", [RangeImageGeometry(tuple(range(8, -8, -1)), 16), tiny_model.tiny_card().view])
+def test_a_network_sees_a_scan_from_the_height_of_its_training(tmp_path: Path, view: Any) -> None:
+    """As the scan is, where the sensor stands as high as the training sensor."""
+    channels = ("range", "z") if view.kind == "range_image" else ("distance", "height")
+    spec = InputSpec("x", channels, (0.0, 0.0), (10.0, 1.0))
+    card = replace(tiny_model.tiny_card(), view=view, input=spec, mount_height_m=2.6)
+    card = replace(card, classes=("background", "car"))
+    (tmp_path / "own.onnx").write_bytes(tiny_model.model(GRAPH, card=card))
+    points = np.random.default_rng(0).uniform((4.0, -4.0, -2.0, 0.0), (15.0, 4.0, 1.0, 1.0), (400, 4))
+    options = {"agree": False, "boxes_from": "network", "adapt": "none", "on_mismatch": "ignore"}
+    perceive = Perceiver(tmp_path / "own.onnx", mounting=Mounting(2.6, 0.0, 0.66, 0.0), **options)
+    perceive(points.astype(np.float32))
+    expected = projection.project(make_projector(view, spec), points.astype(np.float32)).image
+    np.testing.assert_allclose(perceive.sessions[0].input, expected, atol=1e-5)
