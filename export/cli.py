@@ -14,7 +14,7 @@ from edgeperc import __version__
 from edgeperc.cli.arguments import Options, count, keywords, options, positive, positive_number
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
-from edgeperc.errors import CardError, EdgepercError, MissingExtraError, ModelError
+from edgeperc.errors import CardError, CardMismatchError, EdgepercError, MissingExtraError, ModelError
 from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
@@ -346,8 +346,16 @@ def _card(args: argparse.Namespace) -> None:
         card = ModelCard.from_json(_json_text(args.card))
     except (CardError, UnicodeDecodeError) as exc:
         raise CardError(f"{args.card}: {exc}") from exc
-    card = with_golden(model, card)
-    write_card(model, card, args.out)
+    known = with_golden(model, card)
+    try:
+        write_card(model, known if card.golden is None else card, args.out)
+    except CardMismatchError as exc:
+        if card.golden is None:
+            raise
+        raise CardMismatchError(
+            f"{args.card}: the golden record is of another network ({exc}). Set golden and fitness to null, and empty "
+            "training, metrics, parity and precisions, or what was measured of that network would be said of this one"
+        ) from exc
     print_line(f"{args.out}: {card.name} {card.version}")
 
 

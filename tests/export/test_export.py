@@ -21,6 +21,7 @@ onnx = pytest.importorskip("onnx")
 
 from database_helpers import simulated_kitti
 from filelock import FileLock
+from tiny_model import tiny_card
 from torch import Tensor, nn
 from training_helpers import ablate, interrupted_in_step, make, train
 
@@ -998,6 +999,11 @@ def test_a_card_that_does_not_fit_writes_nothing(
     assert not (tmp_path / "out.onnx").exists()
     said = shell.err(*card_command(tmp_path, path, wrong))
     assert "'probabilities' has shape (1, 3, 32, 1024) in the graph; its card declares" in said
+    copied = replace(card, golden=tiny_card().golden)
+    said = shell.err(*card_command(tmp_path, path, copied))
+    assert "card.json: the golden record is of another network" in said
+    assert "Set golden and fitness to null" in said
+    assert not (tmp_path / "out.onnx").exists()
 
 
 def _renamed(model: onnx.ModelProto) -> None:
