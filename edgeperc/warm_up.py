@@ -118,7 +118,8 @@ class _RehearsedRange(RangeImageNetwork):
         vars(self).update(vars(network))
 
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
-        return PointLabels(points[:, 3].astype(np.uint8), np.ones(len(points), np.bool_), self.card.classes)
+        labels = np.minimum(points[:, 3], len(self.card.classes) - 1).astype(np.uint8)  # it may know one class only
+        return PointLabels(labels, np.ones(len(points), np.bool_), self.card.classes)
 
 
 def warm_up(

@@ -14,13 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numba
 import pytest
 
 from edgeperc import warm_up
 from edgeperc.system.compiling import RARE, fewer_collections
+from edgeperc.system.lanes import Stopwatch
 from edgeperc.warm_up import PARTS, Helpers
 
 MOST_OTHERS = 62
@@ -376,3 +378,12 @@ def test_garbage_is_collected_as_before_afterwards() -> None:
             assert gc.get_threshold()[0] == 0
     finally:
         gc.set_threshold(*before)
+
+
+def test_labels_to_compile_with_are_those_of_the_network() -> None:
+    """Of a network of trucks alone, kernels read beyond their tables: it could be opened now and then."""
+    network = SimpleNamespace(card=SimpleNamespace(classes=("background", "truck")))
+    points, labels = warm_up.car_and_person()
+    points[:, 3] = labels.labels
+    rehearsed = warm_up._RehearsedRange(cast(Any, network)).label(points, None, Stopwatch())
+    assert {*rehearsed.labels.tolist()} == {0, 1}
