@@ -106,9 +106,10 @@ class ObjectNetwork:
         is dropped. Where there are too few points for a look, the other box keeps half of its score. ``by_labels``:
         others show people, too, by the labels of their points. Their boxes have the mean of both scores, and none is
         dropped; people without labels keep half of their scores.
+        Boxes of classes that this network does not know stay where there is no other.
         """
         vehicles, people = _by_kind(objects)
-        shown, labeled = _by_kind(others)
+        shown, labeled = _by_kind([box for box in others if box.label in self.card.classes])
         shown = not_among(vehicles, shown)
         looks = self._look_at(scan, clusters._replace(rectangles=rectangles([*shown, *labeled])))
         looks, of_people = looks[: len(shown)], looks[len(shown) :]
@@ -124,7 +125,8 @@ class ObjectNetwork:
                 for box, look in zip(labeled, of_people.tolist(), strict=True)
             ]
         kept = [replace(box, score=0.5 * box.score) for box in doubted if 0.5 * box.score >= min_score]
-        return join_boxes(vehicles if by_labels else objects, [*more, *labeled, *kept])
+        joined = join_boxes(vehicles if by_labels else objects, [*more, *labeled, *kept])
+        return join_boxes(joined, [box for box in others if box.label not in self.card.classes])
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> Floats:
         """What the network finds at places, (n, 10), with a score of 0 where there are too few points."""
