@@ -74,6 +74,8 @@ def agree(
     fp32 = variants["fp32"]
     runs: dict[str, Variant] = {"fp32": fp32}
     kind, has_bf16 = fp32.card.view.kind, not BF16_FEATURES.isdisjoint(cpu_features())
+    if kind == "pillars":
+        raise ModelError(f"{fp32.name} is of pillars, whose precisions are not compared; ask for a precision by name")
     if kind != "objects" and importlib.util.find_spec("openvino") is not None and has_bf16:
         runs["bf16"] = fp32
     runs |= variants

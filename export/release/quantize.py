@@ -585,7 +585,9 @@ def quantize(
 
 
 def check_fp32(path: Path, card: ModelCard) -> None:
-    """Raise `ModelError` if a model is not in fp32."""
+    """Raise `ModelError` if a model is not in fp32, or of pillars, whose calibration is not made here."""
+    if card.view.kind == "pillars":
+        raise ModelError(f"{path} is of pillars; expected a network of range images, top views, objects or a camera")
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
 

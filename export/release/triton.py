@@ -13,6 +13,7 @@ from pathlib import Path
 from edgeperc.errors import ModelError
 from edgeperc.system.atomic import write_atomic
 from edgeperc.types.card import ModelCard
+from edgeperc.types.detector import PillarGeometry
 from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, model_path
@@ -30,8 +31,11 @@ def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, senso
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]
     taken = {PIPELINE}
     for card, path in files:
-        if card.name.lower() in taken or isinstance(card.view, CameraGeometry):
-            raise ModelError(f"{path}: {card.name} is a camera's, or there are two; expected networks of scans")
+        if card.name.lower() in taken or isinstance(card.view, CameraGeometry | PillarGeometry):
+            raise ModelError(
+                f"{path}: {card.name} is of a camera or of pillars, or there are two; expected networks of range "
+                "images, top views and objects"
+            )
         taken.add(card.name.lower())  # one folder, where upper and lower case are the same
     version = out / PIPELINE / "1"
     version.mkdir(parents=True, exist_ok=True)

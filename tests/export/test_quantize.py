@@ -13,6 +13,8 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+import tiny_model
+from pillar_networks import card_of
 from torch import Tensor, nn
 
 from cli_helpers import Shell
@@ -28,8 +30,17 @@ from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
 from edgeperc.zoo import model_path
 from edgeperc_export.release import quantize as module
-from edgeperc_export.release.quantize import Calibration, LabeledSets, RefusedError, calibration_scans, quantize
+from edgeperc_export.release.agree import agree
+from edgeperc_export.release.quantize import (
+    Calibration,
+    LabeledSets,
+    RefusedError,
+    calibration_scans,
+    check_fp32,
+    quantize,
+)
 from edgeperc_export.release.to_onnx import to_graph, with_golden, write_card
+from edgeperc_export.release.triton import write_repository
 
 
 class Fragile(nn.Module):
@@ -378,3 +389,15 @@ def test_the_shift_is_corrected_where_the_noise_is_above_the_limit(
     card = quantize(small, out, Calibration(scans), ONE, max_noise=limit, race=FASTER)
     assert card.training["quantized"]["noise"] <= limit
     assert len(card.training["quantized"]["left_alone"]) == 2  # nothing was left out
+
+
+def test_networks_of_pillars_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    path, card = tmp_path / "anchors.onnx", card_of("anchors")
+    path.write_bytes(tiny_model.model(tiny_model.graph(), card=card))
+    with pytest.raises(ModelError, match="of pillars"):
+        check_fp32(path, card)
+    with pytest.raises(ModelError, match="of pillars"):
+        agree([path], kitti=None)
+    with pytest.raises(ModelError, match="of pillars"):
+        write_repository(tmp_path / "models", [path])
+    assert [*tmp_path.iterdir()] == [path]
