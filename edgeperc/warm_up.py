@@ -111,7 +111,7 @@ class _RehearsedTop(TopViewNetwork):
         self.index.fill(-1)
 
 
-class _RehearsedRange(RangeImageNetwork):
+class RehearsedRange(RangeImageNetwork):
     """Gives the labels that `car_and_person` wrote into the remission of the points."""
 
     def __init__(self, network: RangeImageNetwork) -> None:
@@ -174,7 +174,7 @@ def warm_up(
         rehearsed_top = None if top is None else _RehearsedTop(top)
         rehearsed = Pipeline(
             rehearsed_top,
-            [_RehearsedRange(network) for network in ranged[:1]],
+            [RehearsedRange(network) for network in ranged[:1]],
             replace(options, full_turn=False),
             alone,
             objects,

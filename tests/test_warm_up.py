@@ -385,5 +385,5 @@ def test_labels_to_compile_with_are_those_of_the_network() -> None:
     network = SimpleNamespace(card=SimpleNamespace(classes=("background", "truck")))
     points, labels = warm_up.car_and_person()
     points[:, 3] = labels.labels
-    rehearsed = warm_up._RehearsedRange(cast(Any, network)).label(points, None, Stopwatch())
+    rehearsed = warm_up.RehearsedRange(cast(Any, network)).label(points, None, Stopwatch())
     assert {*rehearsed.labels.tolist()} == {0, 1}
