@@ -39,7 +39,7 @@ from .objects.refine import label_points, remove_outliers
 from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Stopwatch, Values
 from .types.frame import ModelFrame, turned
-from .types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
+from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, GroundSurface, PointLabels, TopView
 from .types.points import Bytes, Heights, Ids, Ints, Points, Rows
 from .types.sensor import SensorProfile
@@ -97,7 +97,7 @@ class TopViewNetwork:
         self.session, self.card, self.view = session, session.card, view
         self.projector = make_projector(view, session.card.input)
         self.index = np.empty((view.height, view.width), np.int32)
-        self._frame, self._observer = _training_frame(session), Observer(view, sensor)
+        self._frame, self._observer = ModelFrame.of_training(self.card.mount_height_m), Observer(view, sensor)
 
     def project(self, near: View) -> None:
         """Write the points into the network's input (SSADNet 2.1.2)."""
@@ -127,7 +127,7 @@ class RangeImageNetwork:
         self.session, self.card, self.view, self.interpolator = session, session.card, view, interpolator
         self.projector = make_projector(view, session.card.input)
         self.index = np.empty((view.height, view.width), np.int32)
-        self._frame = _training_frame(session)
+        self._frame = ModelFrame.of_training(self.card.mount_height_m)
         self._edges_meet = view.azimuth_left_deg - view.azimuth_right_deg == 360.0
 
     def second(self) -> RangeImageNetwork:
@@ -318,11 +318,6 @@ class Pipeline:
         if self.top is not None:
             objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
-
-
-def _training_frame(session: Session) -> ModelFrame:
-    """Where a network's training points lie: as of the models' vehicle, but for the height in the card."""
-    return ModelFrame(replace(MODEL_MOUNTING, height_m=session.card.mount_height_m))
 
 
 def _absent() -> None:

@@ -32,7 +32,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception, PointLabels, TopView
-from ..types.points import Bytes, Floats, Labels, Mask, Points
+from ..types.points import Bytes, Floats, Labels, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .causes import count_causes
@@ -342,6 +342,7 @@ class Network:
     def point_labels(self, points: Points) -> Bytes:
         """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
+        points = ModelFrame.of_training(self.card.mount_height_m).move_back(read_only(points))
         pixel = project(self.projector, points).pixel
         return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
 

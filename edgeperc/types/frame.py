@@ -50,6 +50,11 @@ class ModelFrame:
         self.t: Floats = raised - self.R @ np.array([*mounting.origin_m, 0.0])
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
 
+    @classmethod
+    def of_training(cls, mount_height_m: float) -> ModelFrame:
+        """Where the training points of a network lie: as of the models' vehicle, but for their height."""
+        return cls(replace(MODEL_MOUNTING, height_m=mount_height_m))
+
     def move(self, points: Points) -> Floats32:
         """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
         return points if self.is_identity else _moved_points(points, self.R, self.t)

@@ -78,15 +78,6 @@ def test_a_point_that_is_not_finite_is_in_no_pillar(value: float, column: int) -
 
 
 @pytest.mark.kernel
-@pytest.mark.parametrize("place", [(0.0, -2.0), (3.9999998, 1.9999998), (0.5, 0.0)])
-def test_points_on_edges_are_in_the_cell_that_begins_there(place: tuple[float, float]) -> None:
-    maker = maker_of(RAW)
-    assert maker.fill(np.array([(*place, 0.0, 0.5)], np.float32)) == 1
-    row, column = maker.pillars.places[0, 2:]
-    assert (row, column) == (math.floor((place[1] + 2.0) / 0.5), math.floor(place[0] / 0.5))
-
-
-@pytest.mark.kernel
 @pytest.mark.parametrize(
     ("y_m", "row"), [(-36.0, 23), (-34.08, 34), (-31.84, 49), (-29.6, 63), (13.6, 333), (38.4, 488), (39.52, 495)]
 )
