@@ -8,7 +8,7 @@ over resampled drives.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -110,8 +110,9 @@ def evaluate(
             )
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
-    perceive, scans = job.scans()
-    for folder in filter(None, map(_folder, datasets)):
+    folders = job.folders()
+    perceive, scans = job.scans(folders)
+    for folder in folders.values():
         check_unit(folder, folder.layout.sensor, _names(folder, split, fold))
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
@@ -146,11 +147,14 @@ class _Job:
     road_by: str | Path | None
     mounted: Mounting | None
 
-    def scans(self, n_threads: int | None = None) -> tuple[Perceiver, list[_Scan]]:
+    def folders(self) -> dict[str, ScanFolder]:
+        """The data sets that are labeled scans of any sensor."""
+        return {str(dataset): folder for dataset in self.datasets if (folder := _folder(dataset)) is not None}
+
+    def scans(self, folders: Mapping[str, ScanFolder], n_threads: int | None = None) -> tuple[Perceiver, list[_Scan]]:
         """The perceiver of the last data set, and the scans of all."""
         split, fold = self.split, self.fold
         judge_of = partial(Judge, self.models, self.perceiving, training_scans=split == "train", n_threads=n_threads)
-        folders = {str(dataset): folder for dataset in self.datasets if (folder := _folder(dataset)) is not None}
         if folders and (self.mounted is not None or self.road_by is not None):
             raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
         _check_names([*folders.values()])
@@ -170,7 +174,7 @@ class _Evaluator:
     """Evaluates scans in a worker process; those without a drive each from the same state of the perceiver."""
 
     def __init__(self, job: _Job, learned: Learned) -> None:
-        self._perceive, self._scans = job.scans(n_threads=1)
+        self._perceive, self._scans = job.scans(job.folders(), n_threads=1)
         self._learned = learned
 
     def __call__(self, numbers: Sequence[int]) -> list[_Figures]:

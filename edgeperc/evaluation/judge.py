@@ -44,6 +44,7 @@ from .tables import ALL_ROUND, BANDS, SITTING, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
+_DRIVES_CHECKED = 10  # by `check_unit`
 
 
 @dataclass(frozen=True)
@@ -390,9 +391,12 @@ def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Byt
 
 
 def check_unit(folder: ScanFolder, sensor: SensorProfile, names: Sequence[str]) -> None:
-    """Warn if the remission of a drive's first scan is in another unit than the sensor's: figures would be worse."""
-    first = {folder.drives[name]: name for name in reversed(names)}
-    tell_beyond(folder.root, sensor, ((name, folder.frame(name).points) for name in first.values()))
+    """Warn if the remission of a drive's first scan is in another unit than the sensor's: figures would be worse. Of a
+    few drives, as these scans are read again.
+    """
+    first = [*{folder.drives[name]: name for name in reversed(names)}.values()]
+    some = first[:: math.ceil(len(first) / _DRIVES_CHECKED)] if first else []
+    tell_beyond(folder.root, sensor, ((name, folder.frame(name).points) for name in some))
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
