@@ -133,9 +133,10 @@ class PrelabelSink:
 
     def _number(self, name: str) -> int:
         """The number of a class, which is new if nobody has named it."""
-        new = 1 + max((each["id"] for each in self._classes.values()), default=-1)
-        entry = {"name": name, "id": new, "color": _COLORS[new % len(_COLORS)]}
-        return int(self._classes.setdefault(name, entry)["id"])
+        if name not in self._classes:
+            new = 1 + max((each["id"] for each in self._classes.values()), default=-1)
+            self._classes[name] = {"name": name, "id": new, "color": _COLORS[new % len(_COLORS)]}
+        return int(self._classes[name]["id"])
 
     def _labelcloud(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         source = Path(scan.name)
