@@ -12,6 +12,7 @@ from ..ground.scan import Scan
 from ..objects.boxes import join_boxes, not_among
 from ..objects.candidate_boxes import (
     LABEL,
+    MERGED,
     SCORE,
     boxes_of_objects,
     confirm_boxes,
@@ -23,7 +24,7 @@ from ..objects.candidate_boxes import (
 from ..objects.candidates import Candidates, CellBuffer, find_candidates
 from ..objects.cluster import PERSONS, RIDES
 from ..objects.crops import MIN_COUNT, Crops, crop_candidates, fill_features, with_points
-from ..types.geometry import rectangles
+from ..types.geometry import oriented_iou, rectangles
 from ..types.perception import Box
 from ..types.points import Floats
 from ..types.views import ObjectGeometry
@@ -103,21 +104,25 @@ class ObjectNetwork:
         """Boxes of this network, and what others show, which gets a look; what one of them alone shows is doubted.
 
         A vehicle that this network sees at a look has its box, with the mean of both scores; one that it does not see
-        is dropped. Where there are too few points for a look, the other box keeps half of its score. ``by_labels``:
-        others show people, too, by the labels of their points. Their boxes have the mean of both scores, and none is
-        dropped; people without labels keep half of their scores.
+        is dropped. Of two that share less than half of what both cover, the one with the better score stays. Where
+        there are too few points for a look, the other box keeps half of its score. ``by_labels``: others show people,
+        too, by the labels of their points. Their boxes have the mean of both scores, and none is dropped; people
+        without labels keep half of their scores.
         Boxes of classes that this network does not know stay where there is no other.
         """
         vehicles, people = _by_kind(objects)
         shown, labeled = _by_kind([box for box in others if box.label in self.card.classes])
-        shown = not_among(vehicles, shown)
+        overlap = oriented_iou(rectangles(shown), rectangles(vehicles)).max(axis=1, initial=0.0)
+        shown = [box for box, most in zip(shown, overlap.tolist(), strict=True) if most <= MERGED]
         looks = self._look_at(scan, clusters._replace(rectangles=rectangles([*shown, *labeled])))
         looks, of_people = looks[: len(shown)], looks[len(shown) :]
         doubted = [box for box, look in zip(shown, looks, strict=True) if look[SCORE] == 0.0]  # without a look
         looks[:, SCORE] = np.where(looks[:, SCORE] >= SEEN, 0.5 * (looks[:, SCORE] + [box.score for box in shown]), 0.0)
         found = boxes_of_objects(merge_boxes(looks, self.card.classes), self.card.classes, min_score)
         more = [box for box in found if box.label not in PERSONS]
-        doubted = not_among(more, doubted)
+        more = [box for box in more if not_among([rival for rival in vehicles if rival.score >= box.score], [box])]
+        vehicles = not_among(more, vehicles)
+        doubted = not_among([*vehicles, *more], doubted)
         if by_labels:
             doubted += not_among(labeled, people)
             labeled = [
@@ -125,7 +130,7 @@ class ObjectNetwork:
                 for box, look in zip(labeled, of_people.tolist(), strict=True)
             ]
         kept = [replace(box, score=0.5 * box.score) for box in doubted if 0.5 * box.score >= min_score]
-        joined = join_boxes(vehicles if by_labels else objects, [*more, *labeled, *kept])
+        joined = join_boxes(vehicles if by_labels else [*vehicles, *people], [*more, *labeled, *kept])
         return join_boxes(joined, [box for box in others if box.label not in self.card.classes])
 
     def _look_at(self, scan: Scan, candidates: Candidates) -> Floats:

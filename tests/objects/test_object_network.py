@@ -180,6 +180,22 @@ def test_no_person_that_others_show_is_lost(
     assert kept == replace(person, score=score)
 
 
+def test_of_two_boxes_at_one_vehicle_the_better_one_stays(scan: SimulatedScan) -> None:
+    """An askew box of this network kept another one's right box away, whatever their scores: a van beside an OS0-128
+    had none.
+    """
+    network, seen, clusters = clustered(scan)
+    boxes = zip(scan.boxes, scan.box_points, strict=True)
+    true = next(box for box, n in boxes if box.label == "car" and n > 300)
+    x, y, z = true.center
+    shown = replace(true, score=0.9)
+    askew = replace(true, score=0.55, center=(x + 1.5, y + 1.0, z), yaw=true.yaw + 0.8)
+    (right,) = network.complete(seen, clusters, [askew], [shown], True, 0.3)
+    assert math.dist(right.center, true.center) < 0.4
+    sure = replace(askew, score=0.97)
+    assert network.complete(seen, clusters, [sure], [shown], True, 0.3) == (sure,)
+
+
 @pytest.mark.parametrize("label", ["car", "van", "truck"])
 def test_a_vehicle_that_others_show_and_a_close_look_does_not_see_is_dropped(scan: SimulatedScan, label: str) -> None:
     """A tree is not: the network knows none."""
