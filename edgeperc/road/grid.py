@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import CardError, OptionError, PointsError
+from ..errors import CardError, OptionError
 from ..ground.observed import OVERHEAD_M, Observer
 from ..ground.planes import heights_above
 from ..preprocess.health import without_drops
@@ -23,8 +23,8 @@ from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.perception import Perception, TopView, sensor_behind
-from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, as_points, read_only
+from ..types.perception import Perception, TopView, scan_of, sensor_behind
+from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .around import knows_road, nearest_is_road
@@ -324,12 +324,8 @@ def split_points(perception: Perception, points: ArrayLike, *, sensor: SensorPro
 
 def _returns_of(perception: Perception, points: ArrayLike, profile: SensorProfile, frame: ModelFrame) -> Points:
     """The scan that was perceived in the frame of the models; NaN in place of what is no return, and of drops."""
-    rows = as_points(points)
-    if len(rows) != perception.n_points:
-        raise PointsError(
-            f"{len(rows)} points with a perception of {perception.n_points}; expected the scan that was perceived"
-        )
-    moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
+    scan = scan_of(perception, points)
+    moved = read_only(frame.move(returns(scan, profile, perception.mounting.origin_m)[0]))
     return read_only(without_drops(moved, profile, frame.eye)[0]) if perception.health.has_drops else moved
 
 

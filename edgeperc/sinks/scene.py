@@ -17,9 +17,10 @@ from ..errors import PointsError
 from ..records import PerceivedScan
 from ..system.clock import nanoseconds_of
 from ..tracking.tracks import Tracks
-from ..types.points import Bytes, Floats, Floats32, as_points
+from ..types.perception import scan_of
+from ..types.points import Bytes, Floats, Floats32
 from ..view.colors import byte_colors
-from ..view.content import check_points, in_model_frame, paint_points
+from ..view.content import in_model_frame, paint_points
 
 BASE, LIDAR, ODOM = "base_link", "lidar", "odom"
 
@@ -38,8 +39,8 @@ def colored_points(scan: PerceivedScan) -> tuple[Floats32, Bytes, tuple[str, ...
     """All points of a scan in its order, their labels (0 without a network of points), the classes, and their colors:
     of a background point on the road, that of its cell of the top view. Raises PointsError.
     """
-    points, perception = as_points(scan.points), scan.perception
-    check_points(points, perception)
+    perception = scan.perception
+    points = scan_of(perception, scan.points)
     point_labels = perception.points
     classes: tuple[str, ...] = ("background",) if point_labels is None else point_labels.classes
     labels = np.zeros(len(points), np.uint8) if point_labels is None else point_labels.labels

@@ -8,10 +8,10 @@ from collections.abc import Collection, Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import OptionError, PointsError
+from ..errors import OptionError
 from ..system.kernels import njit
 from ..types.choices import VEHICLES
-from ..types.perception import Box, Perception
+from ..types.perception import Box, Perception, scan_of
 from ..types.points import Floats, Mask, Points, as_points, read_only
 from . import Track
 from .tracks import PARAMETERS
@@ -111,11 +111,7 @@ def movable_points(
     PointsError
         ``points`` is not the scan of the perception.
     """
-    scan = as_points(points)
-    if len(scan) != perception.n_points:
-        raise PointsError(
-            f"got {len(scan):,} points and a perception of {perception.n_points:,}; pass the scan that was perceived"
-        )
+    scan = scan_of(perception, points)
     found = _inside_any([box for box in perception.boxes if box.label in classes], scan, margin_m)
     if perception.points is not None:
         numbers = [k for k, name in enumerate(perception.points.classes) if name in classes]

@@ -11,11 +11,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..system.kernels import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
-from .points import Floats, Floats32, Points, read_only
+from .points import Floats, Floats32, Points, as_points, read_only
 
 
 def model_rotation(mounting: Mounting) -> Floats:
@@ -55,13 +56,15 @@ class ModelFrame:
         """Where the training points of a network lie: as of the models' vehicle, but for their height."""
         return cls(replace(MODEL_MOUNTING, height_m=mount_height_m))
 
-    def move(self, points: Points) -> Floats32:
-        """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
-        return points if self.is_identity else _moved_points(points, self.R, self.t)
+    def move(self, points: ArrayLike) -> Floats32:
+        """A scan, as a `Perceiver` takes it, (n, 4) float32 in the models' frame, read-only; the same array if nothing
+        moves.
+        """
+        return _moved_points(points, None if self.is_identity else (self.R, self.t))
 
-    def move_back(self, points: Points) -> Floats32:
-        """Points (n, 4) float32 of the models' frame as a sensor of this mounting sees them, read-only."""
-        return points if self.is_identity else _moved_points(points, self.R.T.copy(), -self.R.T @ self.t)
+    def move_back(self, points: ArrayLike) -> Floats32:
+        """Points of the models' frame as a sensor of this mounting sees them; as `move`."""
+        return _moved_points(points, None if self.is_identity else (self.R.T.copy(), -self.R.T @ self.t))
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
@@ -106,9 +109,12 @@ def poses_of(positions: Floats, quaternions: Floats) -> Floats:
     return poses
 
 
-def _moved_points(points: Points, R: Floats, t: Floats) -> Floats32:
-    moved = np.empty(points.shape, np.float32)
-    fill_moved(read_only(points), R, t, moved)
+def _moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Floats32:
+    scan = as_points(points)
+    if motion is None:
+        return scan
+    moved = np.empty(scan.shape, np.float32)
+    fill_moved(read_only(scan), *motion, moved)
     return read_only(moved)
 
 

@@ -9,13 +9,13 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ModelError, PointsError
 from ..system.fields import Fields
 from .choices import DEFAULT_SENSOR, STATIC
 from .mounting import MODEL_MOUNTING, Mounting
-from .points import Floats, Floats32, Ints, Labels, Mask
+from .points import Floats, Floats32, Ints, Labels, Mask, Points, as_points
 from .sensor import RemissionFunction, SensorProfile, get_sensor
 from .views import TopViewGeometry
 
@@ -522,6 +522,15 @@ class Perception:
 
 
 _VIEWS = ("stage_ms", "providers")
+
+
+def scan_of(perception: Perception, points: ArrayLike) -> Points:
+    """The scan that was perceived, as points; PointsError if it is another."""
+    scan = as_points(points)
+    if len(scan) != perception.n_points:
+        what = f"{len(scan):,} points and a perception of {perception.n_points:,}"
+        raise PointsError(f"got {what}; expected the scan that was perceived")
+    return scan
 
 
 def sensor_behind(image: object, given: str | os.PathLike[str] | SensorProfile | None) -> SensorProfile:

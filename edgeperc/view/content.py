@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..camera.image import as_image
-from ..errors import ImageError, PointsError
+from ..errors import ImageError
 from ..ground.planes import fit_ground
 from ..system.printable import printable
 from ..types.frame import ModelFrame
@@ -29,16 +29,6 @@ _LARGEST_BOX_M = 100.0
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of `box_corners`: the edges of a box."""
-
-
-def check_points(points: Points, perception: Perception) -> None:
-    """Raise `PointsError` if ``points`` has a wrong shape or another number of points than the perceived scan."""
-    if points.ndim != 2 or points.shape[1] != 4:
-        raise PointsError(f"points have shape {points.shape}; expected (n, 4): x, y, z, remission")
-    if len(points) != perception.n_points:
-        raise PointsError(
-            f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
-        )
 
 
 def packed(dtype: DTypeLike, *columns: ArrayLike) -> NDArray[Any]:

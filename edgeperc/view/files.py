@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import PointsError
 from ..system.atomic import write_atomic
-from ..types.perception import Perception, PointLabels
-from ..types.points import Points
+from ..types.perception import Perception, PointLabels, scan_of
 from .colors import byte_colors
-from .content import check_points, packed
+from .content import packed
 
 # The raw ids of SemanticKITTI's .label files. It counts vans as cars; 99 is its "other-object".
 SEMANTICKITTI_IDS = {
@@ -32,7 +32,7 @@ SEMANTICKITTI_IDS = {
 _OTHER_ID = 99
 
 
-def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
+def write_ply(perception: Perception, points: ArrayLike, path: str | Path) -> None:
     """Write the labeled scan as a binary PLY file.
 
     One row per input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in
@@ -42,7 +42,7 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     Parameters
     ----------
     perception : Perception
-    points : (n, 4) float32
+    points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: x, y, z [m] in the sensor frame, remission.
     path : str or Path
         An existing file is replaced atomically.
@@ -54,18 +54,18 @@ def write_ply(perception: Perception, points: Points, path: str | Path) -> None:
     OSError
         The file cannot be written.
     """
-    check_points(points, perception)
+    scan = scan_of(perception, points)
     found = _labels_of(perception, "PLY file")
     in_map = perception.origin_m is not None
     fields = [*((name, "<f8" if in_map else "<f4") for name in "xyz"), ("remission", "<f4")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
     colors = byte_colors(found.classes)[found.labels]
-    xyz = perception.to_map(points) if in_map else points
-    rows = packed(fields, *xyz[:, :3].T, points[:, 3], found.labels, *colors.T)
+    xyz = perception.to_map(scan) if in_map else scan
+    rows = packed(fields, *xyz[:, :3].T, scan[:, 3], found.labels, *colors.T)
     kinds = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(found.classes)]
-    header += [f"element vertex {len(points)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]
+    header += [f"element vertex {len(scan)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]
     write_atomic(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
 
 

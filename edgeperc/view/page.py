@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..system.atomic import open_atomic
 from ..system.printable import printable
 from ..types.frame import ModelFrame
-from ..types.perception import Box, Perception, TopView
+from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats32, Points
 from . import content
 from .colors import HIGH, LOW, color_of
@@ -34,13 +34,13 @@ _SHORTEST_S, _LONGEST_S = 0.001, 1.0
 _MOST_WARNINGS = 5
 
 
-def write_html(perception: Perception, points: Points, path: str | Path, *, title: str = "") -> None:
+def write_html(perception: Perception, points: ArrayLike, path: str | Path, *, title: str = "") -> None:
     """Write an interactive 3-D page for a browser. It needs no network.
 
     Parameters
     ----------
     perception : Perception
-    points : (n, 4) float32
+    points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
         not finite or farther than 1 km.
     path : str or Path
@@ -55,9 +55,8 @@ def write_html(perception: Perception, points: Points, path: str | Path, *, titl
     OSError
         The file cannot be written.
     """
-    content.check_points(points, perception)
     classes: dict[str, int] = {}
-    scan, xyz, remission, label = _scan(perception, points, classes)
+    scan, xyz, remission, label = _scan(perception, scan_of(perception, points), classes)
     scan |= {"xyz": _base64(xyz), "remission": _base64(remission), "label": _base64(label)}
     facts = f"{perception.n_points:,} points · {_escaped(content.timing_line(perception))}"
     facts += "".join(f"<br>{_escaped(line)}" for line in content.provider_lines(perception))
@@ -100,14 +99,14 @@ class DrivePage:
         return len(self._scans)
 
     def add(
-        self, perception: Perception, points: Points, stamp_s: float, tracks: Tracks | None = None, *, name: str = ""
+        self, perception: Perception, points: ArrayLike, stamp_s: float, tracks: Tracks | None = None, *, name: str = ""
     ) -> None:
         """Add the next scan of the drive.
 
         Parameters
         ----------
         perception : Perception
-        points : (n, 4) float32
+        points : (n, 4) or (n, 3) array_like, or a structured array
             The scan that was perceived, as in `write_html`.
         stamp_s : float
             Its time [s]. A pause of more than a second is played as a second.
@@ -121,7 +120,7 @@ class DrivePage:
         PointsError
             ``points`` is not the scan that was perceived.
         """
-        content.check_points(points, perception)
+        given = scan_of(perception, points)
         step_s = np.clip(np.nan_to_num(np.subtract(stamp_s, self._stamp_s)), _SHORTEST_S, _LONGEST_S)
         self._time_s += float(step_s) if self._n else 0.0
         self._stamp_s = stamp_s
@@ -131,7 +130,7 @@ class DrivePage:
         for line in perception.fitness:
             if len(self._fitness) < _MOST_WARNINGS:
                 self._fitness[line] = None
-        scan, xyz, remission, label = _scan(perception, points, self._classes, tracks)
+        scan, xyz, remission, label = _scan(perception, given, self._classes, tracks)
         names = [*self._classes]
         near = (np.abs(xyz) < _FARTHEST_M).all(axis=1)
         xyz, remission, label = xyz[near], remission[near], label[near]

@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
 from ..types.frame import ModelFrame
-from ..types.perception import Box, Perception, TopView
+from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
 from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
 from .colors import FAINT, color_of, pixel_colors, rgb
-from .content import check_points, drawable_boxes, drawable_points, perceived_image
+from .content import drawable_boxes, drawable_points, perceived_image
 from .picture import Place, axes_from_above, write_frame
 
 # Sizes in pixels.
@@ -28,7 +29,7 @@ _BESIDE_M, _BEHIND_M, _BEYOND_M = 4.0, 8.0, 2.0  # of the panel from above, outs
 def draw_painted(
     perception: Perception,
     image: Bytes,
-    points: Points,
+    points: ArrayLike,
     calibration: Calibration,
     path: str | Path | None = None,
     *,
@@ -43,7 +44,7 @@ def draw_painted(
         With an `edgeperc.ImageLabels`; its boxes are drawn from above.
     image : (H, W, 3) uint8
         The image that was perceived.
-    points : (n, 4) float32
+    points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: x, y, z [m] in the sensor frame, remission.
     calibration : Calibration
     path : str or Path, optional
@@ -69,7 +70,7 @@ def draw_painted(
         The file cannot be written.
     """
     image, labels = perceived_image(image, perception)
-    check_points(points, perception)
+    points = scan_of(perception, points)
     painted = paint(perception, points, calibration, sensor=sensor)
     road = camera_road(perception, points, calibration, sensor=sensor)
 

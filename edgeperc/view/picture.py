@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
 from ..types.choices import STATIC
-from ..types.perception import Box, Perception, TopView
+from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
 from . import canvas, content
 from .colors import AMBER, FAINT, INK, PANEL, color_of, pixel_colors, ramp, rgb
@@ -52,7 +53,7 @@ class _Drawn(NamedTuple):
         return rgb([color_of(name) for name in self.names])[self.painted]
 
 
-def draw(perception: Perception, points: Points, path: str | Path | None = None, *, title: str = "") -> bytes:
+def draw(perception: Perception, points: ArrayLike, path: str | Path | None = None, *, title: str = "") -> bytes:
     """Draw a scan and what was perceived in it.
 
     Parameters
@@ -60,7 +61,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     perception : Perception
         Without a top view, the picture has no panel from above. The panels show the whole turn if something behind the
         sensor was perceived: a box from above, a class for points in the range image.
-    points : (n, 4) float32
+    points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
         not finite or farther than 1 km.
     path : str or Path, optional
@@ -82,8 +83,7 @@ def draw(perception: Perception, points: Points, path: str | Path | None = None,
     OSError
         The file cannot be written.
     """
-    content.check_points(points, perception)
-    perception, points = content.in_model_frame(perception, points)
+    perception, points = content.in_model_frame(perception, scan_of(perception, points))
     names, painted = content.paint_points(points, perception)
     seen = content.drawable_points(points)
     points, painted = points[seen], painted[seen]

@@ -191,6 +191,9 @@ def test_moved_points_lie_where_the_rule_says(mounting: Mounting, seed: int) -> 
     np.testing.assert_array_equal(moved[:, 3], points[:, 3])
     assert moved.dtype == np.float32
     assert len(ModelFrame(mounting).move(points[:0])) == 0
+    named = np.rec.fromarrays(points.T[::-1], names="intensity,z,y,x")
+    np.testing.assert_array_equal(ModelFrame(mounting).move(named), moved)
+    assert ModelFrame(mounting).move(points[:, :3]).shape == (50, 4)  # a kernel that expects four wrote past the end
 
 
 @pytest.mark.parametrize("kind", ["random", "empty", "one", "not finite", "huge"])

@@ -206,10 +206,11 @@ def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Percep
 
 
 def test_picture_is_the_same_again_and_in_other_threads(drawn: bytes, scan: np.ndarray, perception: Perception) -> None:
-    """And pyplot, of which there is one a process, draws none."""
+    """From named columns in any order, too. And pyplot, of which there is one a process, draws none."""
     before = "matplotlib.pyplot" in sys.modules
     got: list[bytes] = []
-    draw = functools.partial(view.draw, perception, scan, title="a scan")
+    named = np.rec.fromarrays(scan.T[::-1], names="intensity,z,y,x")
+    draw = functools.partial(view.draw, perception, named, title="a scan")
     threads = [threading.Thread(target=lambda: got.append(draw())) for _ in range(2)]
     for thread in threads:
         thread.start()
@@ -357,7 +358,7 @@ def test_refusals(scan: np.ndarray, perception: Perception, tmp_path: Path) -> N
         with pytest.raises(PointsError, match="expected the scan that was perceived"):
             writer(perception, scan[1:], tmp_path / "a")
         with pytest.raises(PointsError, match=r"\(n, 4\)"):
-            writer(perception, scan[:, :3], tmp_path / "a")
+            writer(perception, scan[:, :2], tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
