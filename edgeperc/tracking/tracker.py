@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,6 +74,8 @@ class Tracker:
       begins anew, with new ids (`Tracks.session`).
     - If the scan after a jump continues the times before the jump, the jump was the wrong stamp of one scan: the former
       tracks go on with their ids.
+    - After a pause that is longer than ``ClassParameters.memory_s``, 1.5 s, every track has ended. Where all scans are
+      so far apart, or stamps in other units say so, there are hardly any tracks.
 
     An id is not used again before `reset`.
 
@@ -233,8 +236,10 @@ class Tracker:
         classes = self.class_table[kinds]
 
         dt = stamp_s - session.stamp_s if session.posed is not None else 0.0
-        tracks = session.tracks
-        tracks = tracks[tracks["missed_s"] + dt <= self.class_table["memory_s"][tracks["label"]]]
+        memory_s = self.class_table["memory_s"][session.tracks["label"]]
+        tracks = session.tracks[session.tracks["missed_s"] + dt <= memory_s]
+        if len(memory_s) and dt > memory_s.max():
+            self._warn_of("pause", stamp_s)
         of = self.class_table[tracks["label"]]
         predictions = _predictions(tracks, of, dt)
         state, covariance = _combined(*predictions)
@@ -272,7 +277,7 @@ class Tracker:
         self._next_id += n_born
         return answer
 
-    def _warn_of(self, step: Step, stamp_s: float) -> None:
+    def _warn_of(self, step: Step | Literal["pause"], stamp_s: float) -> None:
         """Say once of each kind of step what it means."""
         if step == "next" or step in self._reported:
             return
@@ -281,6 +286,7 @@ class Tracker:
             "late": "a late or doubled scan has no tracks, and changes none",
             "jump": "the clock jumped, and tracking begins anew, with new ids",
             "return": "the stamp before was wrong, and the tracks before it go on",
+            "pause": "every track ended, as after memory_s without a scan; objects get new ids. Stamps are in seconds",
         }[step]
         last_s = self._clock.last_s
         warnings.warn(f"got a scan at {stamp_s} s after one at {last_s} s: {meaning} (said once)", stacklevel=3)

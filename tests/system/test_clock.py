@@ -168,10 +168,11 @@ def test_a_jump_begins_new_tracks_and_each_case_is_said_once() -> None:
     assert ids[:5] == [[1, 2], [1, 2], [], [], [1, 2]]
     assert ids[5] == ids[6] == [3, 4]
     texts = [str(warning.message) for warning in said]
-    assert len(texts) == 3
+    assert len(texts) == 4
     assert texts[0].startswith("got a scan at 5.1 s after one at 5.1 s: a late or doubled scan has no tracks")
     assert texts[1].startswith("got a scan at 1.0 s after one at 5.2 s: the clock jumped")
-    assert texts[2].startswith("got a scan at 7.1 s after one at 0.2 s: the stamp before was wrong")
+    assert texts[2].startswith("got a scan at 7.0 s after one at 0.1 s: every track ended")
+    assert texts[3].startswith("got a scan at 7.1 s after one at 0.2 s: the stamp before was wrong")
     assert {warning.filename for warning in said} == {__file__}
 
 

@@ -158,7 +158,8 @@ def test_birth_confirmation_coasting_memory_and_death() -> None:
         assert len(tracker.update([], 0.1 * k, STANDING)) == 0  # too often to be reported
     (track,) = tracker.update([box("car", 19.0, 0.0, score=0.95)], 1.8, STANDING)
     assert track.id == 1  # but not forgotten
-    assert len(tracker.update([], 4.5, STANDING)) == 0
+    with pytest.warns(UserWarning, match="4.5 s after one at 1.8 s: every track ended"):  # as with ms
+        assert len(tracker.update([], 4.5, STANDING)) == 0
     tracker.update([box("car", 21.0, 0.0)], 4.6, STANDING)
     (track,) = tracker.update([box("car", 21.0, 0.0)], 4.7, STANDING)
     assert track.id == 2
@@ -509,6 +510,7 @@ def test_a_tracker_takes_perceptions() -> None:
         tracker(perception(None))
 
 
+@pytest.mark.filterwarnings("ignore:.*every track ended")
 @settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_any_boxes_at_any_times_make_finite_tracks(seed: int) -> None:
