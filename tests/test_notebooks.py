@@ -26,6 +26,8 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     for number, cell in enumerate(cells(path), start=1):
         exec(compile("".join(cell["source"]), f"{path.name}, cell {number}", "exec"), names)
     assert plots.get_fignums()
+    image = plots.gca().images[-1]  # of the grid: what no ray has shown does not look drivable
+    assert image.cmap(image.norm(-1)) != image.cmap(image.norm(0))
     plots.close("all")
 
 
