@@ -631,7 +631,8 @@ class Perceiver:
             except FitnessError:
                 self._set_mounting(before)  # nothing is learnt from a refused scan
                 self._remission = matcher
-                self._sensor_estimate = None
+                if self._to_check == CHECKED_SCANS:  # no scan before it told the sensor
+                    self._sensor_estimate = None
                 raise
         scan, health, parts = self._without_drops(scan, upright, watch)
         return Perception(

@@ -806,14 +806,17 @@ def test_a_dense_scan_about_the_vehicle_is_perceived_and_the_doubt_is_told() -> 
         Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="raise")(scan)
 
 
-def test_a_refused_scan_does_not_settle_the_sensor() -> None:
+def test_a_refused_scan_neither_settles_the_sensor_nor_unsettles_it() -> None:
     finds = Perceiver("pointseg", sensor="auto", provider="cpu")
-    scan = urban(8, "vlp-16").points
+    scan = urban(8, "vlp-16").points * np.array([1000.0, 1000.0, 1000.0, 1.0], np.float32)  # millimeters
     with pytest.raises(FitnessError):
-        finds(scan * np.array([1000.0, 1000.0, 1000.0, 1.0], np.float32))  # millimeters
+        finds(scan)
     assert finds.sensor_estimate is None
     finds(urban(8).points)
     assert finds.sensor is get_sensor("hdl-64e")
+    with pytest.raises(FitnessError):
+        finds(scan)
+    assert finds.sensor_estimate is not None
 
 
 def test_auto_is_of_a_perceiver() -> None:
