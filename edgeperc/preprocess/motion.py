@@ -33,6 +33,7 @@ MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of tra
 FASTEST_MPS = 150.0  # of a trajectory; trains are slower
 UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
+COARSEST_S = 0.002  # of times: 0.06 m at 30 m/s
 LONGEST_GAP_S = 2.0  # between poses of a moving sensor: whoever stands still may write none
 
 
@@ -299,6 +300,7 @@ def deskew(
         ``points`` is not a scan, or there is not one time for each point.
     StampError
         ``at_s`` is not finite, or half of the times are more than 10 s from it: in another unit, or on another clock.
+        Or they are in float32 and so large that it rounds them by milliseconds, such as times of today.
     OptionError
         ``motion`` is not a `Motion`, or ``min_range_m`` is not a number of meters from 0.
 
@@ -318,6 +320,12 @@ def deskew(
     if not isinstance(motion, Motion):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion")
     known = moments[np.isfinite(moments)]
+    coarse_s = np.spacing(np.abs(known).max(initial=0.0).astype(np.float32))
+    if getattr(times, "dtype", None) == np.float32 and coarse_s > COARSEST_S:
+        raise StampError(
+            f"got times in float32 of {known.max():.6g} s, which it holds to {coarse_s:.2g} s; expected float64, or "
+            "seconds since the start of the scan"
+        )
     at = (float(known.max()) if len(known) else 0.0) if at_s is None else at_s
     if not math.isfinite(at):
         raise StampError(f"at_s is {at_s}; expected finite seconds")

@@ -138,6 +138,8 @@ def _to_convert(thing: Any) -> tuple[str, str] | None:
             "a scan with its stamp",
             "its points alone, perceive(points, stamp_s), as in: for stamp_s, points in read_scans(...)",
         )
+    if hasattr(thing, "read"):
+        return f"an open file ({kind})", "edgeperc.read_points(path), or its bytes by np.frombuffer"
     if isinstance(thing, Iterator):
         return f"an iterator ({kind})", "one scan a call, as in: for stamp_s, points in read_scans(...)"
     if all(hasattr(thing, axis) for axis in "xyz"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -61,6 +62,7 @@ THINGS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "open3d tensors": (lambda path: Tensors(), r"Open3D .*cloud\.point\.positions\.numpy\(\)"),
     "stamped": (lambda path: next(iter(read_scans(path))), "with its stamp; .*for stamp_s, points in read_scans"),
     "stamped with times": (lambda path: (1.0, POINTS, None), "with its stamp; .*its points alone"),
+    "upload": (lambda path: io.BytesIO(path.read_bytes()), r"an open file \(_io.*read_points\(path\).*np\.frombuffer"),
     "scans": (read_scans, "got an iterator .*one scan a call"),
     "dict": (lambda path: {"points": POINTS}, r"a mapping of points \(builtins\.dict\)"),
     "dict of columns": (
