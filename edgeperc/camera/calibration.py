@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
 from ..types.points import Floats, Points, read_only
-from ..types.rigid import ROW_TOLERANCE, rigid
+from ..types.rigid import ROW_TOLERANCE, numbers_of, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
@@ -50,10 +50,7 @@ class Calibration:
     height: int
 
     def __post_init__(self) -> None:
-        try:
-            K = np.array(self.K, dtype=np.float64)
-        except (OverflowError, TypeError, ValueError) as exc:
-            raise CalibrationError(f"K is not an array of numbers ({exc}); expected (3, 3)") from exc
+        K = numbers_of("K is not an array of numbers", self.K, CalibrationError, "(3, 3)")
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise CalibrationError(f"K has shape {K.shape}; expected a finite (3, 3) matrix, got {self.K!r:.200}")
         T = rigid("T_camera_sensor", self.T_camera_sensor, CalibrationError)

@@ -19,7 +19,7 @@ from ..system.kernels import njit
 from ..types.frame import fill_moved, poses_of
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import Floats, Floats32, Points, as_points, read_only
-from ..types.rigid import rigid
+from ..types.rigid import numbers_of, rigid
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
@@ -127,14 +127,8 @@ class Trajectory:
     T_world_sensor: Floats
 
     def __post_init__(self) -> None:
-        try:
-            times = np.array(self.times_s, np.float64)
-        except (OverflowError, TypeError, ValueError) as exc:
-            raise StampError(f"got times of poses that are not numbers ({exc}); expected seconds") from exc
-        try:
-            poses = np.array(self.T_world_sensor, np.float64)
-        except (OverflowError, TypeError, ValueError) as exc:
-            raise TrackingError(f"got poses that are not matrices ({exc}); expected (n, 4, 4) numbers") from exc
+        times = numbers_of("got times of poses that are not numbers", self.times_s, StampError, "seconds")
+        poses = numbers_of("got poses that are not matrices", self.T_world_sensor, TrackingError, "(n, 4, 4) numbers")
         if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
             raise StampError(f"got {times.size} times of poses; expected two or more finite ones that rise")
         if poses.shape != (len(times), 4, 4):
@@ -311,10 +305,7 @@ def deskew(
     """
     rows = as_points(points)
     seen = blank_too_near(rows, _OPTIONS.number("min_range_m", min_range_m, 0.0))
-    try:
-        moments: Floats = np.array(times, np.float64)
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise PointsError(f"got times that are not numbers ({exc}); expected ({len(rows)},) seconds") from exc
+    moments = numbers_of("got times that are not numbers", times, PointsError, f"({len(rows)},) seconds")
     if moments.shape != (len(rows),):
         raise PointsError(f"got times of shape {moments.shape}; expected ({len(rows)},), one for each point")
     if not isinstance(motion, Motion):

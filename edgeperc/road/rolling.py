@@ -19,7 +19,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Perception
-from ..types.points import Bytes, Floats, Mask, as_points
+from ..types.points import Bytes, Floats, Mask
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
@@ -199,9 +199,8 @@ class RollingGrid:
         grow = np.array([2.0 * self._margin_m, 2.0 * self._margin_m, 0.0])
         grown = [replace(box, size=tuple((box.size + grow).tolist())) for box in frame.move_boxes(boxes)]
         movable = footprints(grown, self._view)
-        scan = as_points(points)
-        mark = movable_points(perception, scan, classes=self._classes, margin_m=self._margin_m)
-        moved = frame.move(scan)[mark]
+        mark = movable_points(perception, points, classes=self._classes, margin_m=self._margin_m)
+        moved = frame.move(points)[mark]
         with np.errstate(over="ignore"):  # sensors that mark what did not return with the largest float
             row, col, in_view = self._view.cells(moved[:, 0], moved[:, 1])
         movable[row[in_view], col[in_view]] = True

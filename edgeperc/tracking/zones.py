@@ -16,6 +16,7 @@ from ..system.clock import elapsed_s
 from ..system.kernels import njit
 from ..types.perception import Box
 from ..types.points import Floats, Mask, read_only
+from ..types.rigid import numbers_of
 from . import Track, Tracks
 from .tracker import FARTHEST_M
 
@@ -71,10 +72,7 @@ class Zone:
         PointsError
             The points have another shape.
         """
-        try:
-            rows = np.asarray(points, np.float64)
-        except (OverflowError, TypeError, ValueError) as exc:
-            raise PointsError(f"got points that are not numbers ({exc}); expected (n, 2 or more)") from exc
+        rows = numbers_of("got points that are not numbers", points, PointsError, "(n, 2 or more)")
         if rows.ndim != 2 or rows.shape[1] < 2:
             raise PointsError(f"got points of shape {rows.shape}; expected (n, 2 or more): x, y")
         inside = np.empty(len(rows), np.bool_)
@@ -222,10 +220,7 @@ class Line:
 
 
 def _places(name: str, given: Any) -> Floats:
-    try:
-        places: Floats = np.array(given, np.float64, order="C")
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise OptionError(f"{name} has corners that are not numbers ({exc}); expected (k, 2): x, y") from exc
+    places = numbers_of(f"{name} has corners that are not numbers", given, OptionError, "(k, 2): x, y")
     if places.ndim != 2 or places.shape[1] != 2 or not (np.abs(places) <= FARTHEST_M).all():
         raise OptionError(f"{name} has corners of shape {places.shape}; expected (k, 2) finite numbers: x, y")
     places.flags.writeable = False

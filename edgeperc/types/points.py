@@ -87,11 +87,9 @@ def as_points(
             if values.shape[0] in (3, 4):
                 advice = "; pass points.T"
         raise PointsError(f"got an array of shape {values.shape}; expected (n, 4): x, y, z, remission{advice}")
-    if values.shape[1] == 3:
-        return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None, origin_m)
-    if origin_m is not None or (values.dtype.itemsize > 4 and _is_rounded(values[:, :3])):
-        columns = dict(zip(("x", "y", "z", "remission"), values.T, strict=True))
-        return assemble(values.shape[0], columns, [*columns], None, origin_m)
+    if values.shape[1] == 3 or origin_m is not None or _is_rounded(values[:, :3]):
+        columns = dict(zip(("x", "y", "z", "remission"), values.T, strict=False))
+        return assemble(len(values), columns, [*columns], None, origin_m)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
 

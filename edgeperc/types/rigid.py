@@ -1,4 +1,4 @@
-"""Rigid transforms that callers pass: a rotation and a translation, up to rounding."""
+"""Numbers that callers pass, and rigid transforms: a rotation and a translation, up to rounding."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ ROTATION_TOLERANCE = 1e-3
 ROW_TOLERANCE = 1e-6  # of the last row: what is multiplied or inverted in float32 is as far off
 
 
+def numbers_of(what: str, given: ArrayLike, error: type[EdgepercError], expected: str) -> NDArray[np.float64]:
+    """A C-contiguous copy of numbers that a caller passes; otherwise an error of this type, which begins with this."""
+    try:
+        return np.array(given, np.float64, order="C")
+    except (OverflowError, TypeError, ValueError) as exc:
+        raise error(f"{what} ({exc}); expected {expected}") from exc
+
+
 def rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:
     """A copy of a rigid transform, (4, 4), with an exact last row; otherwise an error of this type, with this name."""
-    try:
-        pose: NDArray[np.float64] = np.array(given, np.float64, order="C")
-    except (OverflowError, TypeError, ValueError) as exc:
-        raise error(f"{name} is not a matrix ({exc}); expected (4, 4) numbers") from exc
+    pose = numbers_of(f"{name} is not a matrix", given, error, "(4, 4) numbers")
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise error(f"{name} has shape {pose.shape}; expected (4, 4) finite numbers")
     R, row = pose[:3, :3], pose[3] - [0.0, 0.0, 0.0, 1.0]
