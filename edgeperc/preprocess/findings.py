@@ -285,8 +285,8 @@ def _other_unit(scan: Measures, usual_m: Range) -> Finding | None:
         rounded = f" As float32, they are rounded to {steps:.2g} m: subtract it in double." if steps > _STEPS_M else ""
         return _gross(
             f"The points are about {scan.range_median_m:,.0f} m away, all in one direction: the sensor is not at the "
-            f"origin, as in the frame of a map; subtract the sensor's position from the points: origin_m= or --origin "
-            f"X Y Z.{rounded}"
+            "origin, as in the frame of a map; subtract the sensor's position, which edgeperc.read_points does: "
+            f"origin_m= or --origin X Y Z.{rounded}"
         )
     factor = scan.range_median_m / math.sqrt(near * far)
     unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")

@@ -224,8 +224,8 @@ def assemble(
         middle = ", ".join(f"{np.median(as_float64(values)[np.isfinite(values)]):,.1f}" for values in xyz)
         raise MapError(
             f"the coordinates are those of a map, about ({middle}) m, and would be rounded by more than "
-            f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass the place of the sensor, which is subtracted first: "
-            'origin_m= or --origin X Y Z; "auto" finds that of a level sensor'
+            f"{1e3 * MAX_ROUNDING_M:g} mm as float32; pass edgeperc.read_points the place of the sensor, which it "
+            'subtracts first: origin_m= or --origin X Y Z; "auto" finds that of a level sensor'
         )
     points = np.zeros((n, 4), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):

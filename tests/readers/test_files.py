@@ -769,7 +769,7 @@ def test_coordinates_of_a_map_are_not_rounded(tmp_path: Path, kind: str, place: 
     """A scan whose coordinates float32 would round is refused, and exact if the place of the sensor is subtracted."""
     points, origin = street(4), np.array(MAPS[place])
     source = in_map(tmp_path, kind, points, origin)
-    with pytest.raises(PointsError, match=r"those of a map, about \(.*--origin X Y Z"):
+    with pytest.raises(PointsError, match=r"of a map, about \(.* edgeperc\.read_points .*--origin X Y Z"):
         read_points(source)
     read = read_points(source, origin_m=origin)
     np.testing.assert_allclose(read, points, atol=1e-5)
