@@ -104,6 +104,7 @@ def test_unknown_model_lists_the_available_ones(name: str) -> None:
 def test_models_agree_with_the_zoo() -> None:
     found = {model.name: model for model in edgeperc.models()}
     assert tuple(found) == edgeperc.zoo.shipped_models()
+    assert pickle.loads(pickle.dumps(found)) == found
     assert {name for name, model in found.items() if model.default} == {*edgeperc.zoo.DEFAULT}
     for name, model in found.items():
         assert [f"{name}:{precision}" for precision in model.variants] == [str(v) for v in edgeperc.zoo.resolve(name)]

@@ -135,7 +135,7 @@ def models() -> tuple[ModelInfo, ...]:
                 purpose=purpose(card),
                 default=name in DEFAULT,
                 path=path,
-                variants=MappingProxyType(sizes),
+                variants=sizes,
                 size_mb=sizes[card.precision],
                 licence=str(card.training.get("licence", "not stated")),
             )

@@ -302,7 +302,7 @@ def test_mcap_refuses_and_keeps_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="folder"):
         McapSink(tmp_path / "absent" / "run.mcap")
     sink = McapSink(target)
-    with pytest.raises(PointsError, match="points with a perception"):
+    with pytest.raises(PointsError, match="points and a perception"):
         sink.write(replace(scan, points=scan.points[1:]))
     for stamp_s in (-1.0, math.nan, math.inf, 2.0**32):
         with pytest.raises(PointsError, match="time"):
