@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,12 +91,15 @@ def _anchor_boxes(maps: Values, view: PillarGeometry, head: AnchorHead, score_th
     raw = per_anchor("cls_preds")
     at, labels, scores = _best(raw, head, score_threshold)
     row, column, anchor = at
-    sizes = np.array([each.size_m for each in head.anchors for _ in each.yaws_rad])[anchor]
-    bottoms = np.array([each.bottom_m for each in head.anchors for _ in each.yaws_rad])[anchor]
+    turned = [each for each in head.anchors for _ in each.yaws_rad]
+    sizes = np.array([each.size_m for each in turned])[anchor]
+    bottoms = np.array([each.bottom_m for each in turned])[anchor]
     yaws = np.array([yaw for each in head.anchors for yaw in each.yaws_rad])[anchor]
+    whole = [*zip(view.x_range_m, view.y_range_m, strict=True)]
+    bounds = [each.range_m or (*whole[0], *whole[1]) for each in turned]
     n_rows, n_columns = raw.shape[:2]
-    x = _positions(view.x_range_m, n_columns, head.centered)[column]
-    y = _positions(view.y_range_m, n_rows, head.centered)[row]
+    x = np.array([_positions(each[::2], n_columns, head.centered) for each in bounds])[anchor, column]
+    y = np.array([_positions(each[1::2], n_rows, head.centered) for each in bounds])[anchor, row]
     code = per_anchor("box_preds")[at][:, :7].astype(np.float64)
     boxes = np.empty((len(row), 7))
     diagonal = np.hypot(sizes[:, 0], sizes[:, 1])
@@ -181,7 +184,7 @@ def _best(
     return place, raw[place].argmax(axis=1), np.clip(scores, 0.0, 1.0)
 
 
-def _positions(limits: tuple[float, float], n: int, centered: bool) -> Floats:
+def _positions(limits: Sequence[float], n: int, centered: bool) -> Floats:
     """Where anchors stand along an axis [m]."""
     low, high = limits
     if centered:

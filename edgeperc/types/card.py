@@ -51,7 +51,7 @@ KNOWN_CLASSES = ("background", "drivable", "road", *VEHICLES, "pedestrian", "cyc
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
 N_OBJECT_VALUES = 8  # in addition to the classes and the sizes: place, axis, front, overlap
 FIELDS = Fields(
-    "the card", CardError, "export the model again", optional=("front", "block", "head")
+    "the card", CardError, "export the model again", optional=("front", "block", "head", "range_m")
 )  # earlier cards lack them
 VIEWS = {
     "top_view": TopViewGeometry,

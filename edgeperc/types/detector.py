@@ -87,8 +87,14 @@ class Anchor:
     size_m: tuple[float, float, float]  # length, width, height [m]
     bottom_m: float  # z of its bottom in the frame of the training points [m]
     yaws_rad: tuple[float, ...]  # its directions [rad]
+    # where it stands: lowest x and y, highest x and y [m], of mmdet3d's ``ranges``; None: the bounds of the view
+    range_m: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        if self.range_m is not None:
+            x_low, y_low, x_high, y_high = _FIELDS.numbers("head.anchors: range_m", self.range_m, 4, -1e4, 1e4)
+            if not (x_low < x_high and y_low < y_high):
+                _FIELDS.refuse("head.anchors: range_m", self.range_m, "lowest x and y, then highest x and y")
         _FIELDS.numbers("head.anchors: size_m", self.size_m, 3, 0.01, 100.0)
         _FIELDS.number("head.anchors: bottom_m", self.bottom_m, -100.0, 100.0)
         _FIELDS.numbers("head.anchors: yaws_rad", self.yaws_rad, None, -2.0 * math.pi, 2.0 * math.pi)
@@ -104,7 +110,7 @@ class AnchorHead:
     max_candidates: int  # the best ones are decoded, before boxes that overlap are dropped
     across_classes: bool  # whether a box is also dropped if it overlaps a better one of another class
     anchors: tuple[Anchor, ...]  # all at a position, in the order of the channels: anchors, then their yaws
-    # anchors stand in the middle of the positions' cells; else the outermost ones on the bounds of the view
+    # anchors stand in the middle of the positions' cells; else the outermost ones on the bounds
     centered: bool
     channels_last: bool  # whether the outputs are (1, rows, columns, channels) and not (1, channels, rows, columns)
     box_values: int  # values of a box; those after the seventh (velocities) are ignored

@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -444,9 +445,11 @@ def test_a_golden_record_of_an_output_for_each_part_and_group(n_groups: int) -> 
     assert len(Golden(0, "0" * 64, outputs).outputs) == 6 * n_groups
 
 
-def anchored(bins: list[float] | None, yaw: float, across_classes: bool = False, iou: float = 0.1) -> list[Box]:
+def anchored(
+    bins: list[float] | None, yaw: float, across_classes: bool = False, iou: float = 0.1, **of_anchor: Any
+) -> list[Box]:
     """The boxes of one position: cars of the two anchors there, and a pedestrian at the same place."""
-    anchors = (Anchor((3.9, 1.6, 1.56), -1.78, (0.0, 1.57)), Anchor((3.9, 1.6, 1.73), -1.6, (0.0,)))
+    anchors = (Anchor((3.9, 1.6, 1.56), -1.78, (0.0, 1.57), **of_anchor), Anchor((3.9, 1.6, 1.73), -1.6, (0.0,)))
     head = replace(
         networks.ANCHOR_HEAD,
         classes=("Car", "Pedestrian"),
@@ -482,6 +485,12 @@ def test_bins_of_directions_choose_the_half_turn(yaw: float) -> None:
     without = anchored(None, yaw)[0]
     assert without.front is None
     assert without.yaw == pytest.approx(yaw)
+
+
+def test_anchors_may_stand_within_other_bounds_than_the_pillars() -> None:
+    """As mmdetection3d's of nuScenes, whose outermost were 0.4 m off; row and column are 20 of 0 to 31."""
+    box = anchored(None, 0.0, range_m=(1.0, -10.0, 25.0, 6.0))[0]
+    assert box.center == pytest.approx((1.0 + 24.0 * 20 / 31, -10.0 + 16.0 * 20 / 31, -1.0))
 
 
 def test_overlaps_are_dropped_within_a_class_or_across() -> None:

@@ -88,6 +88,7 @@ def test_missing_entries_are_named(part: str) -> None:
             refuse(less, rf"{part}.*(lacks {name}|kind is None)")
 
 
+ANCHOR = {"size_m": [4, 2, 1.5], "bottom_m": 0, "yaws_rad": [0]}
 WRONG = [
     ("view", {"x_range_m": [69.12, 0]}, r"view\.x_range_m is \(69\.12, 0"),
     ("view", {"x_range_m": [0, 69.2]}, r"view\.x_range_m is .*a multiple of view\.cell_m, 0\.16 m"),
@@ -107,8 +108,9 @@ WRONG = [
     ("head", {"scores": "softmax"}, r"head\.scores is 'softmax'; expected logits or probabilities"),
     ("head", {"classes": ["Car"]}, r"box_classes .*expected a class of boxes for each"),
     ("head", {"anchors": []}, r"the number of head\.anchors is 0"),
-    ("head", {"anchors": [{"size_m": [4, 2], "bottom_m": 0, "yaws_rad": [0]}]}, r"anchors\[0\]\.size_m is \[4, 2\]"),
-    ("head", {"anchors": [{"size_m": [4, 2, 0], "bottom_m": 0, "yaws_rad": [0]}]}, r"size_m\[2\] is 0"),
+    ("head", {"anchors": [{**ANCHOR, "size_m": [4, 2]}]}, r"anchors\[0\]\.size_m is \[4, 2\]"),
+    ("head", {"anchors": [{**ANCHOR, "size_m": [4, 2, 0]}]}, r"size_m\[2\] is 0"),
+    ("head", {"anchors": [{**ANCHOR, "range_m": [-9, 9, -9, 9]}]}, r"range_m is .* expected lowest x and y, then"),
     ("head", {"box_values": 6}, r"head\.box_values is 6; expected a whole number from 7"),
     ("head", {"box_values": 8}, r"head\.box_values is 8; expected 7, or 9 with velocities; angles of two values"),
     ("head", {"box_values": 10}, r"head\.box_values is 10; expected 7, or 9"),
