@@ -610,7 +610,8 @@ class Perceiver:
                 hidden = (self._without_ground(exc),)
             watch.lap("check")
         if check and (roll_deg, before.known.pitch_deg) != (None, None):
-            hidden = (*hidden, self._about_given_tilt(before.contradicted_by(scan)))
+            lying = findings.about_lying(before.known)
+            hidden = (*hidden, lying, self._about_given_tilt(before.contradicted_by(scan)))
             watch.lap("check")
         upright = profile.upright(before.known)
         if not self._frame.is_identity:

@@ -236,6 +236,7 @@ _THROUGH_HALL_M = 18.0
 # share; how near its bumpers are; how deep a garage of a house, at most, and a hall, at least, is along the car.
 _BODY_M, _HALF_CAR_M, _FEW_INSIDE, _BUMPER_M = (0.3, 1.4), (1.9, 0.75), 1e-4, 2.1
 _GARAGE_M, _HALL_LENGTH_M, _FEWEST_AT_END = 8.8, 15.0, 20
+_LYING_DEG = 45.0  # of tilt, beyond which boxes lie rather than stand
 _LOWER_M = -0.3  # than the sensor of the models, on a car
 # Fewer rows than a sensor of 16 beams has (12 to 13 are counted).
 _FEWEST_ROWS, _FEWEST_FROM_ABOVE = 8.0, 4.0  # half of the beams of a high sensor may meet nothing
@@ -451,6 +452,18 @@ def check_hanging(
             f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
             "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic)."
         ),
+    )
+
+
+def about_lying(mounting: Mounting) -> Finding | None:
+    """What to say of a sensor that lies on its side, as a camera's axes do: its boxes cannot stand upright."""
+    tilt_deg = math.degrees(math.acos(min(1.0, abs(mounting.rotation()[2, 2]))))
+    if tilt_deg <= _LYING_DEG:
+        return None
+    return Finding(
+        f"The mounting tilts the axes of the scan by {tilt_deg:.0f} deg, and boxes have no tilt: in the frame of the "
+        "scan they lie askew, as do tracks. Points, cells and grids do not. For upright boxes, turn the points first "
+        "(z, -x, -y of a camera's axes), and give the mounting of the turned ones."
     )
 
 
