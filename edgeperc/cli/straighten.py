@@ -24,9 +24,9 @@ class Straightener:
     def straighten(
         self, stamp_s: float | None, points: Points, times_s: Floats | None, sensor: SensorProfile | None = None
     ) -> Floats32:
-        """Points in the sensor's frame at the scan's stamp, or at its last point; what the sensor drops stays where it
-        is: the own vehicle moves with it. Without poses, the first two scans of a session stay as they are, with a
-        warning.
+        """Points in the sensor's frame at the scan's stamp, or at its last point if the stamp is on another clock; what
+        the sensor drops stays where it is: the own vehicle moves with it. Without poses, the first two scans of a
+        session stay as they are, with a warning.
         """
         if times_s is None:
             raise PointsError(
@@ -50,7 +50,10 @@ class Straightener:
                     stacklevel=2,
                 )
             return points
-        at_s = stamp_s if stamp_s is not None and first_s <= stamp_s <= last_s else last_s
+        # A driver rounds stamps, and drops beams: one just beside the times is still on their clock.
+        beside_s = last_s - first_s
+        is_near = stamp_s is not None and first_s - beside_s <= stamp_s <= last_s + beside_s
+        at_s = stamp_s if is_near else last_s
         scan = points if sensor is None else returns(points, sensor)[0]
         straight = deskew(scan, times_s, motion, at_s=at_s)
         dropped = np.isnan(scan[:, 0])

@@ -378,6 +378,18 @@ def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
     assert straight == [False, False, True, True]
 
 
+@pytest.mark.parametrize("stamp_s", [1699.9999, 1700.0, 1700.1003, 5.0])
+def test_scans_are_straight_at_their_stamps(stamp_s: float) -> None:
+    """Those of drivers are rounded and their first beams dropped: such scans were a turn's motion off, now and then."""
+    points, times = turn(1700.1)
+    motion = Motion.between(pose_at(0.0), 0.0, pose_at(0.1), 0.1)
+    straightener = Straightener(None)
+    for k in range(2):
+        straightener.follow(tracks_at(0.1 * k, pose_at(0.1 * k)))
+    wanted = deskew(points, times, motion, at_s=float(times.max()) if stamp_s == 5.0 else stamp_s)
+    np.testing.assert_array_equal(straightener.straighten(stamp_s, points, times), wanted)
+
+
 def tracks_at(stamp_s: float | None, pose: NDArray[np.float64], session: int = 0, *, is_late: bool = False) -> Any:
     return SimpleNamespace(T_world_sensor=pose, stamp_s=stamp_s, session=session, is_late=is_late)
 
