@@ -29,7 +29,7 @@ from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, check_va
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
 _FARTHEST_M = 1e8  # of a pose: cells are still counted exactly
-_SMALLEST_AREA = 0.05  # of a cell of the road as odometry sees it from above; less, and the road stands upright
+_SMALLEST_AREA = 0.05  # of a cell of the road as odometry sees it from above; less, and the road stands upright or hangs
 
 
 class RollingGrid:
@@ -312,9 +312,9 @@ def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:
     R = pose[:3, :3] @ frame.R.T
     t = pose[:3, 3] - R @ frame.t - MODEL_HEIGHT_M * R[:, 2]
     to_odom = np.column_stack([R[:2, :2], t[:2]])
-    if np.abs(t).max() > _FARTHEST_M or abs(np.linalg.det(R[:2, :2])) < _SMALLEST_AREA:
+    if np.abs(t).max() > _FARTHEST_M or np.linalg.det(R[:2, :2]) < _SMALLEST_AREA:
         raise TrackingError(
-            f"T_odom_sensor puts the road below the sensor at {t.round(1).tolist()}, or upright; expected at most "
-            f"{_FARTHEST_M:g} m, and a frame with z upwards"
+            f"T_odom_sensor puts the road below the sensor at {t.round(1).tolist()}, upright, or upside down; expected "
+            f"at most {_FARTHEST_M:g} m, and a frame with z upwards, in which a sensor that hangs is rolled by 180 deg"
         )
     return to_odom, float(t[2])

@@ -125,6 +125,7 @@ class PerceptionNode:
         self._points: Floats32 | None = None
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
+        self._unplaced = ""
         self._rates = _Rates()
         self._error: Exception | None = None
         self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
@@ -332,8 +333,9 @@ class PerceptionNode:
             pose = pose @ self._rolling.base_from_sensor(*frames, scan.perception.mounting)
             tracks = scan.tracked or ()
             self._rolling.grid.update(scan.perception, scan.points, pose, tracks=tracks)
-        except TrackingError:
+        except TrackingError as exc:
             self._n_unplaced += 1
+            self._unplaced = str(exc)
             return
         if self._outputs[messages.ROLLING].is_wanted:
             message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)
@@ -371,6 +373,7 @@ class PerceptionNode:
             values["age of the newest answer [ms]"] = f"{1e3 * self._stream.age_s:.0f}"
         if self._rolling is not None:
             values |= {"clouds without a pose": self._n_unplaced, "odometry not read": self._poses.n_failed}
+            values |= {"the last of them": self._unplaced} if self._unplaced else {}
         name = f"{self._graph.name.rpartition('/')[2]}: perception"
         return self._messages.diagnostics(
             newest, time.time_ns(), name=name, level=level, message=message, values=values

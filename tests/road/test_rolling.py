@@ -259,12 +259,14 @@ def test_scans_that_cannot_be_taken_in_change_nothing() -> None:
     grid.update(perceived(points, 1.0), points, at)
     before = grid.values()
     upright = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    hanging = np.diag([1.0, -1.0, -1.0, 1.0])  # of points that do not hang: left and right would change places
     for wrong, error, said in (
         (dict(stamp_s=None), StampError, "stamp_s="),
         (dict(stamp_s=math.nan), StampError, "stamp_s="),
         (dict(at=np.zeros((4, 4))), TrackingError, "not rigid"),
         (dict(at=pose(1e9)), TrackingError, "expected at most"),
         (dict(at=upright), TrackingError, "upright"),
+        (dict(at=hanging), TrackingError, "upside down"),
         (dict(points=points[1:]), PointsError, "that was perceived"),
     ):
         given_points = wrong.get("points", points)

@@ -397,6 +397,7 @@ def test_the_grid_with_memory_follows_the_odometry() -> None:
     points, n = street(), 4
     rolling = Rolling(sensor_pose=(1.0, 0.0, 1.73, 0.0, 0.0, 90.0), grid=RollingGrid(size_m=60.0, cell_m=0.5))
     with running(rolling=rolling) as (graph, _, outcomes):
+        until(lambda: graph.published["/diagnostics"])
         for k in range(n):
             stamp_ns = 10**9 + k * 10**8
             graph.odometry(odometry(stamp_ns - 5 * 10**7, 10.0 + k - 0.5, 20.0, 0.0))
@@ -406,6 +407,7 @@ def test_the_grid_with_memory_follows_the_odometry() -> None:
             graph.odometry(b"no odometry")
         graph.give(cloud(points, 10**10))
         assert isinstance(next(outcomes), PerceivedScan)  # without a pose
+        until(lambda: any(v.value == "no pose at the time of the cloud" for v in last_status(graph).values))
     grids = [MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/edgeperc/rolling"]]
     assert len(grids) == n
     assert {grid.header.frame_id for grid in grids} == {"odom"}
