@@ -28,6 +28,10 @@ SEMANTICKITTI_IDS = {
     "building": 50,
     "vegetation": 70,
     "pole": 80,
+    # other classes of SemanticKITTI, by its names
+    **{"bicycle": 11, "bus": 13, "motorcycle": 15, "on-rails": 16, "other-vehicle": 20},
+    **{"person": 30, "bicyclist": 31, "motorcyclist": 32, "parking": 44, "other-ground": 49, "fence": 51},
+    **{"other-structure": 52, "lane-marking": 60, "trunk": 71, "traffic-sign": 81},
 }
 _OTHER_ID = 99
 
@@ -73,7 +77,8 @@ def write_labels(perception: Perception, path: str | Path) -> None:
     """Write SemanticKITTI's ``.label`` layout: a uint32 for every input point, in input order.
 
     The upper 16 bits (the instance) are 0. The lower 16 bits hold the raw id of `SEMANTICKITTI_IDS`: 10 car, 30 person,
-    31 bicyclist, 0 unlabeled (background and points out of view), 99 a class that SemanticKITTI lacks.
+    31 bicyclist, 0 unlabeled (the first class, the background, and points out of view), 99 a class that SemanticKITTI
+    lacks.
 
     Parameters
     ----------
@@ -89,7 +94,7 @@ def write_labels(perception: Perception, path: str | Path) -> None:
         The file cannot be written.
     """
     found = _labels_of(perception, ".label file")
-    ids = np.array([SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in found.classes], dtype="<u4")
+    ids = np.array([0, *(SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in found.classes[1:])], dtype="<u4")
     write_atomic(path, ids[found.labels].tobytes())
 
 

@@ -341,11 +341,13 @@ def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path: Path
 
 
 def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
+    """Of networks with its own names of classes, too: a person was 99, "other-object"."""
     labels = np.arange(len(scan), dtype=np.uint8) % 4
-    named = replace(perception.points, labels=labels, classes=("background", "car", "cyclist", "tram"))
-    write_labels(replace(perception, points=named), tmp_path / "scan.label")
-    raw = np.fromfile(tmp_path / "scan.label", dtype="<u4")
-    np.testing.assert_array_equal(raw, np.array([0, 10, 31, 99])[labels])
+    for first, other, number in (("background", "cyclist", 31), ("unlabeled", "person", 30), ("noise", "trunk", 71)):
+        named = replace(perception.points, labels=labels, classes=(first, "car", other, "tram"))
+        write_labels(replace(perception, points=named), tmp_path / "scan.label")
+        raw = np.fromfile(tmp_path / "scan.label", dtype="<u4")
+        np.testing.assert_array_equal(raw, np.array([0, 10, number, 99])[labels])
 
 
 def test_refusals(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
