@@ -235,7 +235,9 @@ class Pipeline:
             objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score, *looks)
 
         # Objects alone: classes such as road and building are background to the stages below
-        seen, labels = labels, value("refine", PointLabels.objects, labels) if self.ranged else absent
+        seen = labels
+        if self.ranged:
+            labels = value("refine", PointLabels.objects, labels, self.ranged[0].card.box_classes)
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
         clusters = upright = support = absent

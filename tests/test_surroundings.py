@@ -48,6 +48,15 @@ def test_surroundings_have_no_boxes(perceived: tuple[SimulatedScan, Perception])
     assert not perception.require_points().objects().labels[~perception.require_points().in_view].any()
 
 
+def test_a_card_says_which_classes_have_boxes(perceived: tuple[SimulatedScan, Perception]) -> None:
+    perceive = Perceiver("sceneseg", n_threads=1)
+    network = perceive.pipeline.ranged[0]
+    network.card = replace(network.card, box_classes=("pole",))
+    found = perceive(perceived[0].points)
+    assert {box.label for box in found.boxes} == {"pole"}
+    assert np.count_nonzero(found.require_points().labels == SCENE_CLASSES.index("car")) > 100
+
+
 def test_agreement_changes_objects_alone(perceived: tuple[SimulatedScan, Perception]) -> None:
     scan, perception = perceived
     alone = Perceiver(["ssadnet", "sceneseg", "objects"], full_turn=True, n_threads=1, agree=False)(scan.points)

@@ -185,7 +185,7 @@ class ModelCard:
         Index 0 is the background; a camera model has none.
     box_classes : tuple of str
         Classes that boxes may have; a subset of ``classes``. Of a detector, that of each class of its head, in the
-        head's order; several may be one.
+        head's order; several may be one. Of a range image, if empty, all but those of the surroundings.
     box_size_priors : mapping
         Class to usual (length, width, height) [m].
     box_size_spreads : mapping

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -166,15 +166,21 @@ class PointLabels:
     in_view: Mask
     classes: tuple[str, ...]
 
-    def objects(self) -> PointLabels:
+    def objects(self, kinds: Collection[str] = ()) -> PointLabels:
         """The labels of objects alone.
+
+        Parameters
+        ----------
+        kinds : collection of str
+            Classes of objects, as the ``box_classes`` of a card say; by default all but those in `STATIC`.
 
         Returns
         -------
         PointLabels
-            Points of the classes in `STATIC` are background, which has number 0. The same object if there are none.
+            Points of other classes are background, which has number 0. The same object if there are none.
         """
-        names = tuple(name for name in self.classes if name not in STATIC)
+        kinds = kinds or {*self.classes} - {*STATIC}
+        names = tuple(name for k, name in enumerate(self.classes) if k == 0 or name in kinds)
         if names == self.classes:
             return self
         number = np.array([names.index(name) if name in names else 0 for name in self.classes], np.uint8)
@@ -196,7 +202,7 @@ class PointLabels:
         if objects.classes == self.classes:
             return objects
         number = np.array([self.classes.index(name) for name in objects.classes], np.uint8)
-        static = np.isin(self.labels, [k for k, name in enumerate(self.classes) if name in STATIC])
+        static = np.isin(self.labels, [k for k, name in enumerate(self.classes) if name not in objects.classes])
         labels = np.where((objects.labels == 0) & static, self.labels, number[objects.labels])
         return PointLabels(labels, objects.in_view, self.classes)
 
