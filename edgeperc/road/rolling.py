@@ -29,7 +29,7 @@ from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, check_va
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
 _FARTHEST_M = 1e8  # of a pose: cells are still counted exactly
-_SMALLEST_AREA = 0.05  # of a cell of the road as odometry sees it from above; less, and the road stands upright or hangs
+_SMALLEST_AREA = 0.05  # of a cell of the road as odometry sees it from above; less: upright, or hanging
 
 
 class RollingGrid:
