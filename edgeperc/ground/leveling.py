@@ -32,25 +32,16 @@ OTHER_HEIGHT_M = 0.5  # a height that differs by more is another one, however un
 
 @dataclass(frozen=True)
 class MountingEstimate:
-    """A mounting as scans show it.
+    """A mounting as scans show it."""
 
-    Attributes
-    ----------
-    mounting : Mounting
-        A known one: what was given, and the medians over the scans of the rest.
-    height_sd_m, roll_sd_deg, pitch_sd_deg, yaw_sd_deg : float
-        Standard deviation of each value; 0 for one that was given. It includes what streets differ in slope and
-        camber, and what the parts of the ground in a scan differ by, which more scans of one street do not reduce.
-    n_scans : int
-        Scans that showed enough ground.
-    """
-
-    mounting: Mounting
+    mounting: Mounting  # a known one: what was given, and the medians over the scans of the rest
+    # Standard deviation of each value; 0 for one that was given. It includes what streets differ in slope and camber,
+    # and what the parts of the ground in a scan differ by, which more scans of one street do not reduce.
     height_sd_m: float
     roll_sd_deg: float
     pitch_sd_deg: float
     yaw_sd_deg: float
-    n_scans: int
+    n_scans: int  # that showed enough ground
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON."""

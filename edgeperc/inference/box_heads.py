@@ -29,10 +29,8 @@ def decode_slots(card: ModelCard, slots: Floats32, labels: Labels, scores: Float
     """Decode axis-aligned boxes on the road, best score first, with the class of the segmentation at their centers
     (SSADNet 2.2.1 B).
 
-    slots : (K, 4), perhaps with the batch's axis; center column, center row, extent across columns and along rows, as
-        shares of the image from its far left corner. One is empty if an extent is below 0.5 m, or if there is no box
-        class at its center.
-    labels, scores : from `decode_classes`; the score of a box is that of its center's class.
+    slots : (K, 4), perhaps with the batch's axis (docs/concepts/cards.md). One is empty if an extent is below 0.5 m, or
+        if there is no box class at its center, whose score a box has.
     """
     view = _view_of(card)
     values = _slot_rows(card, slots, 4)
@@ -142,10 +140,7 @@ def decode_dense(
 ) -> list[Box]:
     """Decode oriented boxes from a heat map of centers, best score first, and a box regressed at every cell.
 
-    dense : (C, H / 4, W / 4), perhaps with the batch's axis; C is 9 or 11. Heat-map logit; center's offset from the
-        cell's center in rows and columns [cells of this map]; logarithms of length and width [m]; sine and cosine of
-        twice the yaw; center's z [m]; logarithm of the height [m]; a vector (x, y) whose component along a heading is
-        the logit that the front is there, or nothing: then the yaw is in -pi/2..pi/2 and ``front`` is None.
+    dense : (9 or 11, H / 4, W / 4), perhaps with the batch's axis (docs/concepts/cards.md).
     named_from : boxes with a lower score are places only: their label is empty, which saves most of the time.
 
     The paper reads a box's class at its center pixel, which may be a hole in the roof. Here the class with the largest

@@ -60,20 +60,9 @@ _MISSING = Finding(
 
 
 class RemissionMatcher:
-    """Finds the remission function for a sensor's scans: that of the profile, or one that is matched to the scans.
+    """Finds the remission function for a sensor's scans: that of the profile, or ``matched`` to the scans; None while
+    the profile's fits.
 
-    Parameters
-    ----------
-    sensor : SensorProfile
-
-    Attributes
-    ----------
-    sensor : SensorProfile
-    matched : RemissionFunction or None
-        Used instead of the profile's function; None while that one fits.
-
-    Notes
-    -----
     The quantiles of the raw remission by range and incidence are compared with the training sensor's
     (`edgeperc.preprocess.sensor_fit.match_quantiles`). If the profile's function, or mere scaling, does not give that
     distribution, `sensor_fit.fit_functions` fits a function to the quantiles. Every function increases, so the
@@ -100,22 +89,10 @@ class RemissionMatcher:
         return self.n_scans >= FROZEN_AFTER
 
     def add(self, points: Points) -> tuple[RemissionMatcher, SensorProfile, tuple[Finding, ...]]:
-        """Use one more scan; this matcher does not change.
+        """A matcher that used one more scan, the sensor with the function for it, and what to say of the remission.
 
-        Parameters
-        ----------
-        points : (n, 4) float32
-            From `returns.returns`: x, y, z [m] in the sensor frame, remission in the sensor's raw unit. A scan
-            whose remission is out of the profile's range, or in another unit, or that has too few points, is not used.
-
-        Returns
-        -------
-        matcher : RemissionMatcher
-        sensor : SensorProfile
-            With the function for this scan, for `condition.scale` or `condition.condition`.
-        findings : tuple of Finding
-            A sentence when the remission is missing for the first time, and when a function is matched for the first
-            time; neither is gross.
+        points : from `returns.returns`, with raw remission. A scan whose remission is out of the profile's range, or in
+            another unit, or that has too few points, is not used.
         """
         more = RemissionMatcher(self.sensor)
         vars(more).update(vars(self))
@@ -206,13 +183,7 @@ def quantile_difference(raw: Floats, wanted: Floats, sensor: SensorProfile) -> f
 
 
 def is_missing(points: Points) -> bool:
-    """Whether all points, at least 300, have one remission: a constant, or 0 because there is no such field.
-
-    Parameters
-    ----------
-    points : (n, 4) float32
-        Remissions that are not finite are skipped.
-    """
+    """Whether all points, at least 300 with a finite remission, have one: a constant, or 0 without such a field."""
     raw = points[:, 3]
     some = raw[:: max(1, len(raw) // _FEWEST)]  # nearly always, a few points are enough
     if _n_values(some) > 1:
