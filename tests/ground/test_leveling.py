@@ -614,18 +614,11 @@ def test_a_given_tilt_that_is_not_the_grounds_is_told_of(
     assert MountingEstimator(Mounting(1.73, -179.0, 0.0)).contradicted_by(hanging) is None
 
 
-@pytest.mark.parametrize(
-    ("mounting", "lies"), [(Mounting(1.73, -90.0, 0.0, -90.0), True), (Mounting(1.73, 178.0, 30.0), False)]
-)
-def test_boxes_of_a_sensor_that_lies_are_told_of(
-    scans: list[NDArray[np.float32]], mounting: Mounting, lies: bool
-) -> None:
+def test_boxes_of_a_sensor_that_lies_are_told_of(scans: list[NDArray[np.float32]]) -> None:
     """As clouds in the axes of a camera, with the transform to the vehicle as mounting."""
-    perceive = Perceiver("pointseg", mounting=mounting, provider="cpu")
-    told = pytest.warns(UserWarning, match="tilts the axes of the scan by 90 deg, and boxes have no tilt")
-    with told if lies else contextlib.nullcontext():
-        found = perceive(seen_by(mounting, scans[0]))
-    assert any("boxes have no tilt" in sentence for sentence in found.fitness) == lies
+    mounting = Mounting(1.73, -90.0, 0.0, -90.0)
+    with pytest.warns(UserWarning, match="tilts the axes of the scan by 90 deg, and boxes have no tilt"):
+        Perceiver("pointseg", mounting=mounting, provider="cpu")(seen_by(mounting, scans[0]))
 
 
 def test_the_ground_around_a_bridge_is_no_tilt(data_root: Callable[[str], Path]) -> None:

@@ -120,26 +120,19 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("part", "change", "message"), WRONG)
+WRONG_CENTERS = [
+    ({"groups": [1, 2]}, r"head\.groups is \(1, 2\); expected numbers from 1 on that add up to the 4 classes"),
+    ({"groups": [4, 0]}, r"head\.groups is \(4, 0\)"),
+    ({"rotation": "yaw"}, r"head\.rotation is 'yaw'; expected sin_cos or cos_sin"),
+    ({"max_candidates": 0}, r"head\.max_candidates is 0"),
+    ({"groups": [1, 1, 1, 1]}, "each once or once for each of the 4 groups"),
+]
+
+
+@pytest.mark.parametrize(("part", "change", "message"), [*WRONG, *(("centers", *each) for each in WRONG_CENTERS)])
 def test_each_wrong_entry_is_named(part: str, change: dict[str, Any], message: str) -> None:
-    given = document()
-    given[part] |= change
-    refuse(given, message)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"groups": [1, 2]}, r"head\.groups is \(1, 2\); expected numbers from 1 on that add up to the 4 classes"),
-        ({"groups": [4, 0]}, r"head\.groups is \(4, 0\)"),
-        ({"rotation": "yaw"}, r"head\.rotation is 'yaw'; expected sin_cos or cos_sin"),
-        ({"max_candidates": 0}, r"head\.max_candidates is 0"),
-        ({"groups": [1, 1, 1, 1]}, "each once or once for each of the 4 groups"),
-    ],
-)
-def test_each_wrong_entry_of_a_center_head_is_named(change: dict[str, Any], message: str) -> None:
-    given = centers()
-    given["head"] |= change
+    given = centers() if part == "centers" else document()
+    given["head" if part == "centers" else part] |= change
     refuse(given, message)
 
 

@@ -27,15 +27,6 @@ def test_surroundings_are_background_among_objects() -> None:
     assert names_of(objects) == ["background", "car", "background", "pedestrian", "background"]
 
 
-def test_classes_of_boxes_are_the_objects() -> None:
-    """A network of one's own may know fences and trunks, which had boxes and tracks."""
-    labels = labels_of("car", "fence", "road", classes=("background", "fence", "car", "road"))
-    objects = labels.objects(("car",))
-    assert objects.classes == ("background", "car")
-    assert names_of(objects) == ["car", "background", "background"]
-    assert names_of(labels.with_objects(objects)) == ["car", "fence", "road"]
-
-
 def test_without_surroundings_nothing_changes() -> None:
     labels = labels_of("car", "background", classes=("background", "car"))
     assert labels.objects() is labels
