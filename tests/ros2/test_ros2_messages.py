@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rosbags")
 
+from ros2_helpers import street
+
 import edgeperc
 from cli_helpers import POINTSEG, Shell, run, write_scan
 from edgeperc.readers.clouds import cloud_points
@@ -43,18 +45,6 @@ BOXES = (
     edgeperc.Box("pedestrian", 0.6, (8.0, -4.0, -0.8), (0.6, 0.5, 1.8), -2.0),
 )
 MESSAGES = RosMessages("lidar_top")
-
-
-def street() -> np.ndarray:
-    """A level road, a wall across it, and points that are not finite."""
-    x, y = np.meshgrid(np.arange(3.0, 40.0, 0.25), np.arange(-9.0, 9.1, 0.25))
-    road = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.73)])
-    y, z = np.meshgrid(np.arange(-2.0, 2.0, 0.1), np.arange(-1.6, 0.0, 0.1))
-    wall = np.column_stack([np.full(y.size, 25.0), y.ravel(), z.ravel()])
-    points = np.vstack([road, wall, [[math.nan, 1.0, 1.0], [1.0, math.inf, 0.0]]])
-    return np.column_stack([points, np.linspace(0.0, 1.0, len(points))]).astype(np.float32)
-
-
 POINTS = street()
 
 
