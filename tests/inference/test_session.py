@@ -117,6 +117,7 @@ def test_the_golden_input_never_changes() -> None:
     ("old", "new", "error", "message"),
     [
         (CARD_KEY.encode(), b"someone.cards", errors.CardError, r"has no card.*edgeperc-export card"),
+        (b'"block":[2,4]', b'"block":[2,2]', errors.CardMismatchError, "its card declares tensor"),
         (b'"schema":3', b'"schema":9', errors.CardError, r"edited\.onnx: the card has schema 9.*upgrade edgeperc"),
         (
             b'"positions":',

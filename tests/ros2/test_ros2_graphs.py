@@ -46,11 +46,6 @@ POINT_CLOUD = (
 POINTS = np.array([[10.0, 1.0, -1.0, 0.5], [5.0, -2.0, 0.25, 1.0]], np.float32)
 
 
-def test_types_in_keys() -> None:
-    """As in the examples of rmw_zenoh's design."""
-    assert type_key("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
-
-
 def test_the_attachment_has_33_bytes() -> None:
     data = attachment(5, 1_700_000_000_000_000_007, bytes(range(16)))
     assert data == (5).to_bytes(8, "little") + (1_700_000_000_000_000_007).to_bytes(8, "little") + b"\x10" + bytes(

@@ -69,6 +69,8 @@ def refuse(document: Any, message: str) -> None:
 def test_card_is_read_back_from_json(card: ModelCard) -> None:
     assert ModelCard.from_json(card.to_json()) == card
     assert ModelCard.from_json(card.to_json()).to_json() == card.to_json()
+    later = json.loads(card.to_json()) | {"from_the_future": [1, 2]}
+    assert ModelCard.from_json(json.dumps(later)) == card
 
 
 def test_a_card_says_whether_boxes_have_a_front() -> None:
@@ -131,11 +133,6 @@ def test_top_view_holds_positions_in_its_cells() -> None:
         assert view.holds(*place)
     for place in ((5.99, 0.0), (46.0, 0.0), (20.0, 10.0), (20.0, -10.01), (-20.0, 0.0)):
         assert not view.holds(*place)
-
-
-def test_unknown_keys_are_ignored() -> None:
-    document = json.loads(TOP_VIEW_CARD.to_json()) | {"from_the_future": [1, 2]}
-    assert ModelCard.from_json(json.dumps(document)) == TOP_VIEW_CARD
 
 
 @pytest.mark.parametrize("key", sorted(json.loads(TOP_VIEW_CARD.to_json())))
