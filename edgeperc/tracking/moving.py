@@ -20,6 +20,7 @@ MOVABLE = frozenset(
     {
         *VEHICLES,
         *("bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
+        *("construction_vehicle", "emergency_vehicle", "other_vehicle", "other-vehicle", "on-rails"),  # of data sets
         *("pedestrian", "person", "person_sitting", "cyclist", "bicyclist", "motorcyclist"),
     }
 )

@@ -105,7 +105,7 @@ def test_what_could_move_is_marked_by_class_and_by_box() -> None:
     labels = PointLabels(
         np.array([0, 1, 2, 3, 0, 1], np.uint8),
         np.array([1, 1, 1, 1, 1, 0], np.bool_),
-        ("background", "car", "wall", "pedestrian"),
+        ("background", "other-vehicle", "wall", "pedestrian"),  # SemanticKITTI's were in maps
     )
     perception = perceived(6, [car(20, 0), Box("cone", 0.9, (0, 0, 0), (1, 1, 1), 0.0)], labels)
     points[4, 2] = -0.9
