@@ -118,7 +118,7 @@ FLOORS = {
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
         cli.report cli.scans cli.sinks
-        cli.cvat cli.evaluation.sensors cli.fit_sensor cli.info cli.side_by_side
+        cli.cvat cli.evaluation.sensors cli.fit_sensor cli.info cli.outputs cli.side_by_side
         cli.evaluation.scans cli.run
         cli.demo cli.evaluation.tracking cli.ros2
         cli.main

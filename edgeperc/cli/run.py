@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import re
 import sys
 import time
 import warnings
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +31,7 @@ from .arguments import (
     positive_number,
 )
 from .output import print_error, print_line, progress
+from .outputs import check_outputs, files_of
 from .report import Report
 from .scans import (
     Scans,
@@ -44,7 +42,6 @@ from .scans import (
     find_images,
     find_scans,
     is_folder,
-    is_recording,
     output_names,
     reading_options,
     scan_folders,
@@ -75,7 +72,6 @@ if TYPE_CHECKING:
 
 _KINDS = ("png", "html", "labels", "ply")
 _BETWEEN_DRIVES_S = 100.0  # more than the 60 s over which a tracker remembers its tracks
-_NUMBERED = re.compile(r"\d{6,}\.bin")  # the file of ``--static`` of a scan in a capture
 
 
 def add_parser(commands: Commands) -> None:
@@ -222,7 +218,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     check_scan_files(arguments, scans)
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
-    _check_outputs(arguments, kinds, images, scans, targets)
+    check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
     for folder in {target.parent for target in targets if kinds and isinstance(target, Path)}:
@@ -309,78 +305,6 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
         require("PIL", "view", "Drawing an animation", package="pillow")
-
-
-def _check_outputs(
-    arguments: argparse.Namespace,
-    kinds: Sequence[str],
-    images: Mapping[Path, Path | None],
-    scans: Sequence[Path],
-    targets: Sequence[Path],
-) -> None:
-    """Check that no file is a scan, or would be one of its folder for the next run, and none is written twice."""
-    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES
-    from ..readers.images import IMAGE_SUFFIXES
-
-    read = [source for source in (*scans, *images.values()) if source is not None]
-    sources = {_real(source) for source in read}
-    listed = {_real(source.parent) for source in read if source not in (*arguments.paths, *arguments.scan)}
-    suffixes = (*SCAN_SUFFIXES, *CAPTURE_SUFFIXES, *(IMAGE_SUFFIXES if images else ()))
-    outputs: list[tuple[str, Path]] = []
-    # Files are opened for it, so only where their scans have files of their own.
-    has_own = not images and bool(kinds or arguments.static is not None)
-    captures = {scan for scan in scans if has_own and is_recording(scan)}
-    for scan, target in zip(scans, targets, strict=True):
-        first = target / "000000" if scan in captures else target
-        outputs += [("--out", file) for file in _files_of(arguments, first, kinds, bool(images)).values()]
-    for (_, file), n in Counter(outputs).items():
-        if n > 1:  # of a.png and a_scan.png
-            arguments.usage_error(f"the pictures of two images would both be {file}; rename one of the images")
-    outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
-    for name in wanted_sinks(arguments):
-        value = getattr(arguments, name)
-        outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
-    if arguments.static is not None:  # scans of a capture get numbers
-        from ..sinks.static import file_name
-
-        written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
-        _check_static(arguments, written_of, captures)
-        names = {"000000.bin" if scan in captures else file_name(scan.name) for scan in written_of}
-        outputs += [("--static", arguments.static / name) for name in sorted(names)]
-    if arguments.labels_for == "cvat":
-        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
-    written: dict[str, str] = {}
-    for option, file in outputs:
-        if _real(file) in sources and option != "--static":  # which refuses it scan by scan
-            arguments.usage_error(
-                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
-            )
-        if file.suffix.lower() in suffixes and _real(file.parent) in listed and _real(file) not in sources:
-            arguments.usage_error(
-                f"{option}: {file} would be read with the {'images' if images else 'scans'} of its folder by the next "
-                "run; choose another folder"
-            )
-        other = written.setdefault(_real(file), option)
-        if other != option:
-            arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
-
-
-def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
-    """Check that no file of ``--static`` replaces another scan of the run, which may not even have been read yet."""
-    from ..sinks.static import file_name
-
-    sources = {_real(scan) for scan in scans}
-    files = ((scan, _real(arguments.static / file_name(scan.name))) for scan in scans if scan not in captures)
-    replaced = {file for scan, file in files if file in sources and file != _real(scan)}
-    if captures:  # their scans get numbers, and nobody knows yet how many there are
-        folder = Path(_real(arguments.static))
-        beside = {source for source in sources if Path(source).parent == folder}
-        replaced |= {source for source in beside if _NUMBERED.fullmatch(Path(source).name)}
-    if replaced:
-        arguments.usage_error(
-            f"{min(replaced)} is one of the scans and would be overwritten by --static with another one; choose "
-            "another folder"
-        )
 
 
 def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
@@ -546,7 +470,7 @@ class _Run:
                     perception = perceive(points, stamp_s, origin_m=how["origin_m"])
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
-                    wanted = _files_of(self._arguments, file, self._kinds, False)
+                    wanted = files_of(self._arguments, file, self._kinds, False)
                     yield self._answered(name, points, perception, perceive.sensor, wanted, at_s)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
@@ -595,7 +519,7 @@ class _Run:
             origin = None if scan is None else self._origin(scan)
             points = None if scan is None else read_points(scan, **file_options(arguments) | {"origin_m": origin})
             perception = perceive(points, image=image, origin_m=origin)
-            wanted = _files_of(arguments, target, self._kinds, True)
+            wanted = files_of(arguments, target, self._kinds, True)
             if "image" in wanted:
                 view.draw_image(perception, image, wanted.pop("image"), title=path.name)
             if points is None:
@@ -708,7 +632,7 @@ def _alone(
     perceivers = perceivers or _Perceivers(arguments)
     perceive = perceivers.of(with_mounting(stated_sensor(arguments), arguments))
     run = _Run(arguments, perceivers, kinds, Sinks(arguments))
-    return perceive, run.scans, lambda target: [*_files_of(arguments, target, kinds, False).values()]
+    return perceive, run.scans, lambda target: [*files_of(arguments, target, kinds, False).values()]
 
 
 def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
@@ -718,19 +642,3 @@ def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
 
     pattern = get_sensor(sensor).pattern
     return None if pattern is None or not is_capture(path) else pattern.accumulate_s
-
-
-def _real(path: Path) -> str:
-    return str(path) if isinstance(path, Remote) else os.path.realpath(path)
-
-
-def _files_of(arguments: argparse.Namespace, target: Path, kinds: Sequence[str], of_image: bool) -> dict[str, Path]:
-    """The files to write by kind; ``"image"`` is the picture of an image, ``"both"`` that of an image and its scan."""
-    files = {kind: target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}") for kind in kinds}
-    if of_image and "png" in files:
-        files["image"] = files.pop("png")
-        if arguments.scan:
-            files["png"] = target.with_name(f"{target.name}_scan.png")
-        if arguments.calib is not None:
-            files["both"] = target.with_name(f"{target.name}_both.png")
-    return files

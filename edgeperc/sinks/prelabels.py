@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..camera.calibration import read_kitti_calibration, warn_off_center
-from ..errors import OptionError
+from ..errors import CalibrationError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
 from ..types.choices import VEHICLES
@@ -121,7 +121,8 @@ class PrelabelSink:
             classes = [*self._classes.values()]
             document = {"classes": classes, "default": classes[0]["id"], "type": "object_detection", "format": _FORM}
             name = Path("labels/_classes.json")
-            self._write_json(str(name if whole else part_of(name)), "", document)
+            (self._folder / "labels").mkdir(exist_ok=True)
+            write_atomic(self._folder / (name if whole else part_of(name)), _json(document))
             if not whole:
                 warn_of(self._folder / part_of(name), self._folder / name)
         elif self._kind == "cvat" and not self._document.closed:
@@ -210,17 +211,16 @@ class PrelabelSink:
         self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
 
     def _write_json(self, name: str, scan: str, document: Any) -> None:
-        self._write(name, scan, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+        self._write(name, scan, _json(document))
 
     def _write(self, name: str, scan: str, content: bytes) -> None:
-        target = self._files.checked(self._folder / name, scan)
+        target = self._folder / name
         target.parent.mkdir(exist_ok=True)
-        if scan and target.exists() and target.read_bytes() != content:  # hours of work may be in it
-            raise OptionError(
-                f"{target} exists with other content, perhaps corrected by hand, and stays; choose another folder, or "
-                "delete it"
-            )
-        write_atomic(target, content)
+        self._files.write(target, scan, content)
+
+
+def _json(document: Any) -> bytes:
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _known_classes(path: Path) -> dict[str, dict[str, Any]]:
@@ -239,9 +239,17 @@ def _known_classes(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def calibration_of(calib: Path, scan: str) -> Path:
-    """KITTI's calibration of a scan: a file or a raw drive's folder for all, or a folder with one for each."""
-    of_day = (calib / "calib_cam_to_cam.txt").exists()
-    return calib / f"{stem_of(scan)[0]}.txt" if calib.is_dir() and not of_day else calib
+    """KITTI's calibration of a scan: a file or a raw drive's folder for all, or a folder with one for each. Raises
+    CalibrationError.
+    """
+    if not calib.is_dir() or (calib / "calib_cam_to_cam.txt").exists():
+        return calib
+    own = calib / f"{stem_of(scan)[0]}.txt"
+    if not own.exists():
+        raise CalibrationError(
+            f"{own}, the calibration of {scan}, is missing; add it, pass one file for all scans, or leave this scan out"
+        )
+    return own
 
 
 def cvat_cuboid(box: Box) -> dict[str, list[float]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Thread
 
 from ..errors import OptionError
-from ..system.atomic import beside, name_part, name_whole
+from ..system.atomic import beside, name_part, name_whole, write_atomic
 
 _SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 
@@ -36,6 +36,15 @@ class ScanFiles:
         if source != scan:
             raise OptionError(f"{target} is already the file of {source}; run each folder of scans by itself")
         return target
+
+    def write(self, target: Path, scan: str, content: bytes) -> None:
+        """Write the file of a scan, in place of none with other content; OptionError as `checked`, OSError."""
+        if self.checked(target, scan).exists() and target.read_bytes() != content:  # a drive's only copy, hours of work
+            raise OptionError(
+                f"{target} exists with other content, perhaps corrected by hand or of another drive, and stays; "
+                "choose another folder, or delete it"
+            )
+        write_atomic(target, content)
 
 
 class RunFile:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
-from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Floats32, Mask, as_points
 from .run_file import ScanFiles, stem_of
@@ -27,7 +26,8 @@ class StaticSink:
     A file has the name and the format of the scan's file: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply`` with x, y,
     z and remission of the remaining points, in their order; ``.pcd.bin`` with the ring, too. Scans of captures and
     bags become ``NUMBER.bin``, float32 x, y, z, remission. Points whose place in a map is known (``origin_m``) stay in
-    the map, as doubles; those of ``.bin`` are float32. Files are replaced atomically.
+    the map, as doubles; those of ``.bin`` are float32. A file that is there stays, if it differs: it may be the scan of
+    another drive.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class StaticSink:
         self.n_points = self.n_removed = 0
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write one scan. Raises OptionError without tracks, and if the file would replace the scan or that of another;
+        """Write one scan. Raises OptionError without tracks, and if the file would replace the scan or another one;
         PointsError if a ``.pcd.bin`` file holds another number of points than the scan; OSError.
         """
         points = as_points(scan.points)
@@ -71,9 +71,9 @@ class StaticSink:
             raise OptionError("there are no tracks, so nothing is known to move; track the boxes (--track)")
         if self._without == "movable" or (scan.tracks is not None and scan.tracks.is_late):
             gone |= movable_points(scan.perception, points)
-        target = self._files.checked(self._folder / file_name(scan.name), scan.name)
         xyz: NDArray[Any] = points[:, :3] if scan.perception.origin_m is None else scan.perception.to_map(points)
-        write_atomic(target, _content(xyz, points[:, 3], ~gone, scan.name))
+        content = _content(xyz, points[:, 3], ~gone, scan.name)
+        self._files.write(self._folder / file_name(scan.name), scan.name, content)
         self.n_points += len(points)
         self.n_removed += int(np.count_nonzero(gone))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 from ..system.atomic import write_atomic
 from ..types.perception import Perception, PointLabels, scan_of
 from .colors import byte_colors
@@ -84,17 +84,25 @@ def write_labels(perception: Perception, path: str | Path) -> None:
     ----------
     perception : Perception
     path : str or Path
-        An existing file is replaced atomically.
+        An existing file is replaced atomically, if it can be of this scan and this function.
 
     Raises
     ------
     PointsError
         The perception has no classes of points.
+    OptionError
+        The file there has labels of another number of points, or others than are written: perhaps the truth.
     OSError
         The file cannot be written.
     """
     found = _labels_of(perception, ".label file")
     ids = np.array([0, *(SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in found.classes[1:])], dtype="<u4")
+    there = np.fromfile(path, "<u4") if Path(path).is_file() else np.empty(0)
+    if len(there) not in (0, len(found.labels)) or not np.isin(there, [*SEMANTICKITTI_IDS.values(), _OTHER_ID]).all():
+        raise OptionError(
+            f"{path} has {len(there):,} labels of another scan, or labels that edgeperc does not write, perhaps the "
+            f"truth, and stays; this scan has {len(found.labels):,} points. Choose another folder, or delete it"
+        )
     write_atomic(path, ids[found.labels].tobytes())
 
 

@@ -164,8 +164,10 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
     assert [path.name for path in written] == [f"{k:06d}.bin" for k in range(12)]
     assert written[0].read_bytes() == POINTS.tobytes()  # as yet nothing is known to move
     np.testing.assert_array_equal(read_points(written[-1]), expected(AHEAD))
-    assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "out") == 0
-    assert len(read_points(tmp_path / "out/000000.bin")) == len(expected(AHEAD))
+    assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "movable") == 0
+    assert len(read_points(tmp_path / "movable/000000.bin")) == len(expected(AHEAD))
+    assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "out") == 1  # as of another drive
+    assert (tmp_path / "out/000000.bin").read_bytes() == POINTS.tobytes()
     assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "drive") == 1
     assert (tmp_path / "drive/000003.bin").read_bytes() == POINTS.tobytes()
     for wrong in (["--static", tmp_path / "out"], ["--movable"]):
@@ -185,6 +187,20 @@ def test_no_scan_is_replaced_by_another_one(
     said = shell.err("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
     assert "would be overwritten by --static with another one" in said
     assert (tmp_path / "a/000001.bin").read_bytes() == POINTS.tobytes()
+
+
+@pytest.mark.parametrize("options", [("--static", "out", "--movable"), ("--labels-for", "kitti", "--out", "out")])
+def test_drives_whose_files_have_one_name_are_told_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell, options: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in "ab":
+        Path(folder).mkdir()
+        POINTS.tofile(f"{folder}/000001.bin")
+    assert "the files of a/000001.bin and of b/000001.bin would both be" in shell.err("run", "a", "b", *options)
+    Path("calib").mkdir()
+    if options[0] == "--labels-for":
+        assert "calib/000001.txt, the calibration of 000001.bin" in shell.err("run", "a", *options, "--calib", "calib")
 
 
 def sinks_of(folder: Path, *options: object) -> Sinks:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from checkout import printed
 from edgeperc import Tracker, view
-from edgeperc.errors import MissingExtraError, PointsError, TrackingError
+from edgeperc.errors import MissingExtraError, OptionError, PointsError, TrackingError
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
 from edgeperc.ground.planes import fit_ground
 from edgeperc.readers.files import read_points
@@ -348,6 +348,11 @@ def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, 
         write_labels(replace(perception, points=named), tmp_path / "scan.label")
         raw = np.fromfile(tmp_path / "scan.label", dtype="<u4")
         np.testing.assert_array_equal(raw, np.array([0, 10, number, 99])[labels])
+    write_labels(perception, tmp_path / "scan.label")  # of the same scan, by another network
+    for there in (raw[1:], raw | 7 << 16, raw + 1):  # another drive's, with instances, and with classes of the truth
+        there.tofile(tmp_path / "scan.label")
+        with pytest.raises(OptionError, match="perhaps the truth"):
+            write_labels(perception, tmp_path / "scan.label")
 
 
 def test_refusals(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:

@@ -1,0 +1,127 @@
+"""Where a run writes: the files of each scan, none of which may replace a scan or another one's."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from ..system.remote import Remote
+from .scans import is_recording
+from .sinks import wanted_sinks
+
+_NUMBERED = re.compile(r"\d{6,}\.bin")  # the file of ``--static`` of a scan in a capture
+
+
+def check_outputs(
+    arguments: argparse.Namespace,
+    kinds: Sequence[str],
+    images: Mapping[Path, Path | None],
+    scans: Sequence[Path],
+    targets: Sequence[Path],
+) -> None:
+    """Check that no file is a scan, or would be one of its folder for the next run, and none is written twice."""
+    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES
+    from ..readers.images import IMAGE_SUFFIXES
+
+    read = [source for source in (*scans, *images.values()) if source is not None]
+    sources = {_real(source) for source in read}
+    listed = {_real(source.parent) for source in read if source not in (*arguments.paths, *arguments.scan)}
+    suffixes = (*SCAN_SUFFIXES, *CAPTURE_SUFFIXES, *(IMAGE_SUFFIXES if images else ()))
+    outputs: list[tuple[str, Path]] = []
+    # Files are opened for it, so only where their scans have files of their own.
+    has_own = not images and bool(kinds or arguments.static is not None or arguments.labels_for is not None)
+    captures = {scan for scan in scans if has_own and is_recording(scan)}
+    for scan, target in zip(scans, targets, strict=True):
+        first = target / "000000" if scan in captures else target
+        outputs += [("--out", file) for file in files_of(arguments, first, kinds, bool(images)).values()]
+    for (_, file), n in Counter(outputs).items():
+        if n > 1:  # of a.png and a_scan.png
+            arguments.usage_error(f"the pictures of two images would both be {file}; rename one of the images")
+    outputs += [("--gif", arguments.out / "tracks.gif")] if arguments.gif else []
+    for name in wanted_sinks(arguments):
+        value = getattr(arguments, name)
+        outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
+    written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
+    if arguments.static is not None:  # scans of a capture get numbers
+        from ..sinks.static import file_name
+
+        _check_static(arguments, written_of, captures)
+        names = {"000000.bin" if scan in captures else file_name(scan.name) for scan in written_of}
+        outputs += [("--static", arguments.static / name) for name in sorted(names)]
+    if arguments.labels_for == "cvat":
+        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
+    _check_drives(arguments, written_of, captures)
+    if arguments.labels_for is not None and arguments.calib is not None:
+        from ..sinks.prelabels import calibration_of
+
+        for scan in written_of:
+            if scan not in captures:
+                calibration_of(arguments.calib, scan.name)
+    written: dict[str, str] = {}
+    for option, file in outputs:
+        if _real(file) in sources and option != "--static":  # which refuses it scan by scan
+            arguments.usage_error(
+                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
+            )
+        if file.suffix.lower() in suffixes and _real(file.parent) in listed and _real(file) not in sources:
+            arguments.usage_error(
+                f"{option}: {file} would be read with the {'images' if images else 'scans'} of its folder by the next "
+                "run; choose another folder"
+            )
+        other = written.setdefault(_real(file), option)
+        if other != option:
+            arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
+
+
+def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
+    """Check that no file of ``--static`` replaces another scan of the run, which may not even have been read yet."""
+    from ..sinks.static import file_name
+
+    sources = {_real(scan) for scan in scans}
+    files = ((scan, _real(arguments.static / file_name(scan.name))) for scan in scans if scan not in captures)
+    replaced = {file for scan, file in files if file in sources and file != _real(scan)}
+    if captures:  # their scans get numbers, and nobody knows yet how many there are
+        folder = Path(_real(arguments.static))
+        beside = {source for source in sources if Path(source).parent == folder}
+        replaced |= {source for source in beside if _NUMBERED.fullmatch(Path(source).name)}
+    if replaced:
+        arguments.usage_error(
+            f"{min(replaced)} is one of the scans and would be overwritten by --static with another one; choose "
+            "another folder"
+        )
+
+
+def _check_drives(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
+    """Check that no two scans have one name where files have those of their scans, before half of the run is lost."""
+    from ..sinks.run_file import stem_of
+    from ..sinks.static import file_name
+
+    for option, name_of in (("static", file_name), ("labels_for", lambda name: stem_of(name)[0])):
+        named: dict[str, Path] = {}
+        for scan in scans if getattr(arguments, option) is not None else ():
+            name = name_of("000000" if scan in captures else scan.name)
+            if (other := named.setdefault(name, scan)) is not scan:
+                arguments.usage_error(
+                    f"--{option.replace('_', '-')}: the files of {other} and of {scan} would both be called {name}; "
+                    "run each drive by itself, with a folder of its own"
+                )
+
+
+def _real(path: Path) -> str:
+    return str(path) if isinstance(path, Remote) else os.path.realpath(path)
+
+
+def files_of(arguments: argparse.Namespace, target: Path, kinds: Sequence[str], of_image: bool) -> dict[str, Path]:
+    """The files to write by kind; ``"image"`` is the picture of an image, ``"both"`` that of an image and its scan."""
+    files = {kind: target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}") for kind in kinds}
+    if of_image and "png" in files:
+        files["image"] = files.pop("png")
+        if arguments.scan:
+            files["png"] = target.with_name(f"{target.name}_scan.png")
+        if arguments.calib is not None:
+            files["both"] = target.with_name(f"{target.name}_both.png")
+    return files
