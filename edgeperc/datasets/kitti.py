@@ -335,9 +335,10 @@ def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
 
 ROAD_CLASSES = ("other", "road", "vehicle")
 
-# Raw ids of SemanticKITTI: road and lane marking; car, bus, on-rails, truck and other vehicle, standing and moving.
+# Raw ids of SemanticKITTI: road and lane marking; car, bus, truck and other vehicle, standing and moving; all others.
 ROAD_IDS = (40, 60)
 VEHICLE_IDS = (10, 13, 18, 20, 252, 257, 258, 259)
+_OTHER_IDS = (0, 1, 11, 15, 16, 30, 31, 32, 44, 48, 49, 50, 51, 52, 70, 71, 72, 80, 81, 99, 253, 254, 255, 256)
 
 # Raw drive of each odometry sequence with labels.
 SEQUENCE_DRIVES = {
@@ -405,9 +406,14 @@ class SemanticKitti:
         return folder / "velodyne" / f"{stem}.bin", folder / "labels" / f"{stem}.label"
 
     def frame(self, name: str) -> RoadFrame:
-        """Read one scan and its labels; raise `PointsError` if their numbers differ."""
+        """Read one scan and its labels; raise `PointsError` if their numbers differ, or a label is unknown."""
         scan, labels_of = self.files(name)
         points = read_points(scan)
         raw = read_numbers(labels_of, len(points))
+        if unknown := np.setdiff1d(raw, [*ROAD_IDS, *VEHICLE_IDS, *_OTHER_IDS]).tolist():
+            raise PointsError(
+                f"{labels_of}: no class for {', '.join(map(str, unknown[:5]))}; expected SemanticKITTI's raw numbers "
+                "(10: car, 40: road), not those of training; of a set with its own, pass FOLDER:DESCRIPTION.json"
+            )
         labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
         return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

@@ -173,6 +173,9 @@ def test_semantickitti_files(tmp_path: Path) -> None:
     raw[1:].tofile(tmp_path / "sequences/77/labels/000000.label")
     with pytest.raises(PointsError, match="14 labels for a scan of 15 points"):
         sequences.frame("77/000000")
+    (raw % 20).tofile(tmp_path / "sequences/77/labels/000000.label")  # as of training: nothing was road, in silence
+    with pytest.raises(PointsError, match="no class for 2, 8, 12, 17, 19; expected SemanticKITTI's raw numbers"):
+        sequences.frame("77/000000")
 
 
 @pytest.fixture(scope="module")
