@@ -49,9 +49,9 @@ def node(operator: str, inputs: str, outputs: str, more: bytes = b"") -> bytes:
     return field(1, names + field(4, operator.encode()) + more)
 
 
-def shaped(name: str, shape: tuple[int, ...]) -> bytes:
+def shaped(name: str, shape: tuple[int, ...], kind: int = 1) -> bytes:
     dims = b"".join(field(1, number(1, n)) for n in shape)
-    return field(1, name.encode()) + field(2, field(1, number(1, 1) + field(2, dims)))
+    return field(1, name.encode()) + field(2, field(1, number(1, kind) + field(2, dims)))
 
 
 def integers(name: str, *values: int) -> bytes:
@@ -63,8 +63,13 @@ CONVOLUTION = node("Conv", "x w", "y", integers("kernel_shape", 1, 1))
 INITIALIZER = field(5, tensor("w", (2, 2, 1, 1), WEIGHTS.tobytes()))
 
 
+HALF = node("Cast", "half", "x", field(5, field(1, b"to") + number(3, 1) + number(20, 2)))
+
+
 def graph(*parts: bytes) -> bytes:
-    return b"".join(parts) + field(2, b"g") + field(11, shaped("x", SHAPE)) + field(12, shaped("y", SHAPE))
+    """Of the nodes and weights ``parts``; with `HALF` first, its input is in half precision."""
+    given = shaped("half", SHAPE, 10) if parts[0] is HALF else shaped("x", SHAPE)
+    return b"".join(parts) + field(2, b"g") + field(11, given) + field(12, shaped("y", SHAPE))
 
 
 def tiny_card() -> ModelCard:

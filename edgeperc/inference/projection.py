@@ -19,6 +19,7 @@ from ..errors import CardError, PointsError
 from ..ground.planes import find_ground
 from ..system.kernels import njit
 from ..types.card import CHANNELS, InputSpec
+from ..types.frame import OF_MODELS, ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import Floats32, Heights, Ints, Ints64, Points, read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
@@ -547,9 +548,10 @@ def input_heights(projector: Projector, points: Points) -> Floats32 | None:
     return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
 
 
-def project(projector: Projector, points: Points) -> Projection:
+def project(projector: Projector, points: Points, seen_from: ModelFrame = OF_MODELS) -> Projection:
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
     points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.
+    seen_from : `ModelFrame.of_training` of the network.
     """
-    return projector.project(points, input_heights(projector, points))
+    return projector.project(seen_from.move_back(points), input_heights(projector, points))

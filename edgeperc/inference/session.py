@@ -76,6 +76,11 @@ GOLDEN_SHARE = 0.9
 MAX_ROWS, GOLDEN_ROWS = 256, 16
 # Of a detector's inputs beside the points: onnxruntime's names of the types that a graph may take.
 WHOLE = {"int32": np.int32, "int64": np.int64, "float": np.float32}
+IN_FLOAT32 = (
+    "export the graph again with inputs and outputs in float32; weights may stay in half precision (keep_io_types=True "
+    "of onnxconverter_common.float16)"
+)
+"""What to do with a graph that takes or gives other types."""
 # The largest network of this project takes 0.2 s on one core of a server.
 MAX_FIRST_RUN_S = 30.0
 
@@ -316,10 +321,12 @@ class Session:
         fits = len(shape) == len(expected) and all(
             e is None or not isinstance(s, int) or s == e for s, e in zip(shape, expected, strict=True)
         )
-        if not fits or node.type not in [f"tensor({each})" for each in types]:
+        is_of_type = node.type in [f"tensor({each})" for each in types]
+        if not fits or not is_of_type:
             raise CardMismatchError(
                 f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card declares "
                 f"tensor({' or '.join(types)}) of shape {expected} (None: any)"
+                + ("" if is_of_type else f"; {IN_FLOAT32}")
             )
 
     def _bind(self, run_options: Any) -> None:

@@ -75,6 +75,10 @@ class ModelFrame:
         return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
 
 
+OF_MODELS = ModelFrame(MODEL_MOUNTING)
+"""Of the shipped networks, which moves nothing."""
+
+
 def turned(points: Points, angle_rad: float) -> Floats32:
     """Scan (n, 4) float32 as a sensor that is turned to the left by an angle sees it, read-only."""
     result = np.empty(points.shape, np.float32)

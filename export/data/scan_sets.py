@@ -29,7 +29,7 @@ from edgeperc.preprocess.interpolation import Interpolator
 from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing, tell_beyond
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
-from edgeperc.types.frame import ModelFrame
+from edgeperc.types.frame import OF_MODELS, ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.points import Bytes, Heights, Ints, Labels, Points
@@ -134,9 +134,10 @@ def labeled_scan(
 
 
 def seen_by_network(
-    projector: TopViewProjector | RangeImageProjector, scan: LabeledScan
+    projector: TopViewProjector | RangeImageProjector, scan: LabeledScan, seen_from: ModelFrame = OF_MODELS
 ) -> tuple[LabeledScan, Projection]:
-    """A training scan projected as the runtime projects a scan of its sensor.
+    """A training scan projected as the runtime projects a scan of its sensor, for a network with points
+    ``seen_from`` there.
 
     Returns scan: If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as
         the nearest of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m
@@ -144,15 +145,16 @@ def seen_by_network(
     Returns projected: Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
     """
     points = np.ascontiguousarray(scan.points, np.float32)
-    projected = project(projector, points)
+    projected = project(projector, points, seen_from)
     if scan.sensor is None or isinstance(projector, TopViewProjector):
         return scan, projected
     interpolator = interpolator_of(projector.view, scan.sensor)
     if not interpolator.needed or not len(points):
         return scan, projected
-    dense, filled = interpolator.fill(points, projected.index)
+    filled_in, filled = interpolator.fill(seen_from.move_back(points), projected.index)
+    dense = seen_from.move(filled_in)
     image = np.empty(projector.shape, np.float32)
-    projector.fill_image(dense, filled, image, _heights_of_view(projector, dense, len(points)))
+    projector.fill_image(filled_in, filled, image, _heights_of_view(projector, dense, len(points)))
     labels = np.full(len(dense), IGNORE, np.uint8)
     labels[: len(points)] = scan.labels
     new = filled >= len(points)

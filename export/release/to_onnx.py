@@ -25,10 +25,11 @@ from edgeperc.camera.image import ImageScaler
 from edgeperc.errors import CardMismatchError, EdgepercError, ModelFileError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
-from edgeperc.inference.session import WHOLE, Session, golden_feed, golden_input, golden_shape
+from edgeperc.inference.session import IN_FLOAT32, WHOLE, Session, golden_feed, golden_input, golden_shape
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.perception import Box
 from edgeperc.types.points import Bytes, Floats32, Mask
 from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
@@ -234,7 +235,9 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     if not {*names} <= {*present}:
         raise CardMismatchError(f"card names outputs {names}, the graph has {present}")
     for node in nodes:
-        kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"), np.float32)
+        kind = WHOLE.get(node.type.removeprefix("tensor(").removesuffix(")"))
+        if kind is None:
+            raise CardMismatchError(f"{node.name!r} is {node.type} in the graph; {IN_FLOAT32}")
         n_more = max(node.shape[0] - len(x), 0) if len(feed) > 1 and isinstance(node.shape[0], int) else 0
         padding = [(0, n_more), *[(0, 0)] * (feed[node.name].ndim - 1)]
         feed[node.name] = np.pad(feed[node.name], padding, mode="edge").astype(kind)
@@ -277,12 +280,12 @@ def views(card: ModelCard, samples: Sequence[NDArray[Any] | LabeledScan]) -> Ite
             yield image, np.ones(image.shape[1:], np.bool_)
         return
     assert isinstance(card.view, RangeImageGeometry | TopViewGeometry)  # `compare_objects` makes inputs of objects
-    projector = make_projector(card.view, card.input)
+    projector, seen_from = make_projector(card.view, card.input), ModelFrame.of_training(card.mount_height_m)
     for sample in samples:
         projected = (
-            seen_by_network(projector, sample)[1]
+            seen_by_network(projector, sample, seen_from)[1]
             if isinstance(sample, LabeledScan)
-            else project(projector, np.ascontiguousarray(sample, np.float32))
+            else project(projector, np.ascontiguousarray(sample, np.float32), seen_from)
         )
         yield projected.image.copy(), projected.index >= 0
 

@@ -19,6 +19,7 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+import tiny_model
 from database_helpers import simulated_kitti
 from filelock import FileLock
 from tiny_model import tiny_card
@@ -39,6 +40,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
@@ -48,13 +50,24 @@ from edgeperc_export import make as make_module
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.data.augment import ObjectBank
 from edgeperc_export.data.roads import DRAWN, drawn_roads
+from edgeperc_export.data.scan_sets import seen_by_network
 from edgeperc_export.data.scans import LabeledScan, mirrored
 from edgeperc_export.data.simulate import parity_samples, simulate
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
 from edgeperc_export.release import to_onnx
 from edgeperc_export.release.models_page import models_page, sums_of
-from edgeperc_export.release.to_onnx import ParityError, export, halve, load, terms_of, to_graph, verify, write_card
+from edgeperc_export.release.to_onnx import (
+    ParityError,
+    export,
+    halve,
+    load,
+    terms_of,
+    to_graph,
+    verify,
+    with_golden,
+    write_card,
+)
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
 from edgeperc_export.training.log import curve_table
@@ -63,6 +76,7 @@ from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Points, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.training.train import make_optimizer, make_schedule
+from scenes import urban
 
 Exported = Callable[[str, str], tuple[Path, Path, ModelCard]]
 
@@ -129,6 +143,34 @@ def untrained(network: str, folder: Path, **changes: object) -> Path:
 
 def weights(path: Path) -> dict[str, Tensor]:
     return torch.load(path, weights_only=True)["averaged"]
+
+
+def test_a_network_of_half_precision_is_told_how_to_take_scans(tmp_path: Path) -> None:
+    """As onnxruntime would say it when it runs, nobody knew what to do."""
+    card = replace(tiny_card(), input=replace(tiny_card().input, name="half"), golden=None)
+    path = tmp_path / "half.onnx"
+    path.write_bytes(
+        tiny_model.model(tiny_model.graph(tiny_model.HALF, tiny_model.CONVOLUTION, tiny_model.INITIALIZER), card=card)
+    )
+    for opened in (lambda: with_golden(onnx.load(path), card), lambda: Session(path, "cpu")):
+        with pytest.raises(CardMismatchError, match=r"'half' is tensor\(float16\).*inputs and outputs in float32"):
+            opened()
+
+
+@pytest.mark.parametrize("of_sensor", [None, "vlp-16"])
+def test_samples_are_seen_from_the_height_of_the_training_sensor(of_sensor: str | None) -> None:
+    """As `Perceiver` shows them: calibrated from another height, int8 rounds values that never come."""
+    view, spec = RANGE_IMAGE, InputSpec("x", ("range", "z"), (0.0, 0.0), (10.0, 1.0))
+    card = replace(tiny_card(), view=view, input=spec, mount_height_m=2.6)
+    seen, frame = urban(3).points, ModelFrame.of_training(2.6)  # by a sensor at that height
+    sample = LabeledScan(frame.move(seen), np.zeros(len(seen), np.uint8), (), (), np.zeros((500, 500), np.uint8))
+    sample = replace(sample, sensor=None if of_sensor is None else get_sensor(of_sensor))
+    expected = seen_by_network(make_projector(view, spec), replace(sample, points=seen))[1].image
+    ((image, _),) = to_onnx.views(card, [sample])
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+    if of_sensor is None:
+        ((image, _),) = to_onnx.views(card, [frame.move(seen)])
+        np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
 @pytest.mark.usefixtures("small_views")
