@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -44,6 +47,9 @@ SCAN_KEYS = (
     "sensor_health",
 )
 """Keys of a record, in their written order; every record has all of them."""
+
+
+_NUMBER = re.compile(r"(?<![0-9])0*([0-9]{1,6})[^0-9]*$")  # of a frame; times have more digits
 
 
 def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
@@ -84,15 +90,40 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
     }
 
 
-def read_boxes(path: Path | str) -> list[list[Box]]:
-    """Read the boxes of a drive by scan, in the sensor frame, as ``edgeperc run --json`` prints them."""
+def read_boxes(path: Path | str, frames: Mapping[str, int] | None = None) -> list[list[Box]]:
+    """Read the boxes of a drive by frame, in the sensor frame, as ``edgeperc run --json`` prints them. The frame is
+    that of the scan's name without suffix in ``frames``, else the number at the end of its name, or the line's, if some
+    scan has no number. Warns of frames between others that have no line. Raises TrackingError, OSError.
+    """
     from .types.perception import Box
 
+    scans, boxes = list[str](), list[list[Box]]()
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-        return [[Box.from_dict(box) for box in json.loads(line)["boxes"]] for line in lines]
+        for line in Path(path).read_text(encoding="utf-8").splitlines():
+            record = json.loads(line)
+            boxes.append([Box.from_dict(box) for box in record["boxes"]])
+            scans.append(str(record.get("scan")))
     except (KeyError, RecursionError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc
+    numbers = [_NUMBER.search(Path(scan).name) for scan in scans]
+    found = [int(number[1]) for number in numbers if number] if all(numbers) else [*range(len(scans))]
+    if frames:
+        found = [frames.get(Path(scan).stem, -1) for scan in scans]
+    by_frame: dict[int, int] = {}
+    for line_number, (frame, scan) in enumerate(zip(found, scans, strict=True)):
+        other = by_frame.setdefault(frame, line_number)
+        if frame < 0 or other != line_number:
+            what = "is none of the sequence" if frame < 0 else f"has the frame of {scans[other]}, {frame}"
+            raise TrackingError(f"{path}: {scan} {what}; expected one line for each scan of one sequence")
+    last = max(by_frame, default=-1)
+    if len(by_frame) <= last:
+        first = next(frame for frame in range(last) if frame not in by_frame)
+        warnings.warn(
+            f"{path} has no line for {last + 1 - len(by_frame)} of {last + 1} frames, such as {first}; they count as "
+            "frames without boxes",
+            stacklevel=2,
+        )
+    return [boxes[by_frame[frame]] if frame in by_frame else [] for frame in range(last + 1)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,8 @@ def add_parser(commands: Commands) -> None:
     reading("--sequences SEQ...", "names such as 0000 0002 (default: all that have labels)")
     reading(
         "--boxes FILE",
-        "track the boxes in this file, which 'edgeperc run --json' printed for one sequence (default: none)",
+        "track the boxes in this file, which 'edgeperc run --json' printed for one sequence; a scan's frame is the "
+        "number in its name (default: none)",
     )
     add_sensor(reading)
     rules = options(parser, "evaluation")
@@ -93,14 +94,15 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
     arguments.classes = [*dict.fromkeys(arguments.classes)]
     make_places(arguments.json, arguments.gif)
-    from ...evaluation.tracking import evaluate_kitti, sequence_names
+    from ...evaluation.tracking import evaluate_kitti, sequence_names, sequence_scans
     from ...records import read_boxes
 
     names = arguments.sequences or sequence_names(arguments.root)
     source = "given detections"
     boxes: dict[str, list[list[Box]]] = {}
     if arguments.boxes is not None:
-        boxes, source = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
+        frames = {path.stem: frame for frame, path in sequence_scans(arguments.root, names[0]).items()}
+        boxes, source = {names[0]: read_boxes(arguments.boxes, frames)}, f"boxes of {arguments.boxes}"
     elif arguments.model or arguments.weights != "default" or not (arguments.root / "detections").is_dir():
         boxes, source = _perceived(arguments, names)
     with progress("sequence") as show:
