@@ -14,7 +14,7 @@ from ..errors import CalibrationError
 from ..types.choices import VEHICLES
 from ..types.points import Bytes, Floats, Floats32, Labels
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, Hits, Rays, fill_cast
-from .scene import Scene, SimulatedScan, place_shapes
+from .scene import NUMBERS, Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
 
 __all__ = ["CAMERA_CLASSES", "VOID", "CameraImage", "forward_camera", "render", "surface_classes", "true_classes"]
@@ -67,7 +67,16 @@ def forward_camera(
         Horizontal field of view [deg].
     at_m : tuple of 3 float
         Place of the camera in the frame of the LiDAR: x ahead, y left, z up [m]. By default as on KITTI's car.
+
+    Raises
+    ------
+    OptionError
+        A number is out of its range.
     """
+    for name, pixels in (("width", width), ("height", height)):
+        NUMBERS.whole(name, pixels, 1, 2**15)
+    NUMBERS.number("fov_deg", fov_deg, 1.0, 179.0)
+    NUMBERS.numbers("at_m", at_m, 3)
     focal = width / (2.0 * math.tan(math.radians(fov_deg) / 2.0))
     K = np.array([[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]])
     T_camera_sensor = _AHEAD.T.copy()
@@ -100,7 +109,10 @@ def render(
     ------
     CalibrationError
         The camera is tilted by more than 20 degrees.
+    OptionError
+        ``max_range_m`` is not above 0.
     """
+    NUMBERS.number("max_range_m", max_range_m, 0.1, math.inf)
     T_world_camera = np.asarray(T_world_sensor, np.float64) @ np.linalg.inv(calibration.T_camera_sensor)
     pose = T_world_camera @ _AHEAD.T
     if not pose[2, 2] >= math.cos(math.radians(MOST_TILT_DEG)):

@@ -12,7 +12,7 @@ from ..types.geometry import wrapped
 from ..types.perception import Box
 from .raycast import LANE, SLOPE_X, SLOPE_Y
 from .roadside import add_beside_people, add_cafe, add_parked_bicycles, add_roadside
-from .scene import Scene
+from .scene import NUMBERS, Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, SHAPES, Street, any_vehicle, random_terrain, strip_row
 
@@ -37,7 +37,13 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     Scene
         Its first objects are the ``boxes``, in order. They stand on the ground of the scene, so z
         differs slightly from the boxes.
+
+    Raises
+    ------
+    OptionError
+        ``mount_height_m`` is no number.
     """
+    NUMBERS.number("mount_height_m", mount_height_m)
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
     vehicles = [box for box in boxes if box.label in VEHICLES]
     heading, curvature = _road_direction(vehicles)

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
+from ..system.fields import Fields
 from ..types.choices import STATIC, VEHICLES
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
@@ -19,10 +20,13 @@ from ..types.sensor import ScanPattern, SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from . import raycast
 
+NUMBERS = Fields("the simulation", OptionError)
+"""How the numbers of all simulations are checked."""
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 # Classes of what a street is made of; the background is what is none of the others, such as walls and fences.
 SCENE_CLASSES = (*POINT_CLASSES, *STATIC)
 TOP_VIEW_CLASSES = ("background", "drivable", *VEHICLES)
+LEAST = 1e-6  # of numbers that are above 0
 _SECTORS = 1800  # of the shapes that rays of a pattern may hit
 MOST_TILT_DEG = 75.0  # rays of one azimuth meet the ground one after the other; on its side, a sensor sees it twice
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,6 +96,7 @@ class Scene:
 
     def at(self, t_s: float) -> Scene:
         """Move the objects by ``t_s`` [s] on the ground, with constant speed and turn rate; return the new scene."""
+        NUMBERS.number("t_s", t_s)
         moved = []
         for each in self.objects:
             turn = each.yaw_rate_rps * t_s
@@ -252,7 +257,13 @@ def simulate(
     ------
     PointsError
         ``T_world_sensor`` is not a rotation and a translation, or tilts the sensor more.
+    OptionError
+        A number is out of its range.
     """
+    NUMBERS.number("max_range_m", max_range_m, 0.1, math.inf)
+    NUMBERS.number("start_s", start_s)
+    if duration_s is not None:
+        NUMBERS.number("duration_s", duration_s, LEAST)
     profile = get_sensor(sensor)
     pose = sensor_pose(scene, profile)
     if T_world_sensor is not None:
@@ -359,7 +370,12 @@ def simulate_sequence(
 
     Yields T_world_sensor: (4, 4) float64.
     Yields scan: ``scan.box_ids`` identify objects across scans.
+
+    Raises OptionError for a number out of its range, errors of `simulate`.
     """
+    NUMBERS.whole("n_scans", n_scans, 0, 10**9)
+    NUMBERS.number("rate_hz", rate_hz, LEAST, 1.0 / LEAST)
+    NUMBERS.number("ego_speed_mps", ego_speed_mps)
     curvature = float(scene.strips[0, 4])
     heading = math.atan2(scene.strips[0, 3], scene.strips[0, 2])
     for k in range(n_scans):

@@ -2,7 +2,7 @@
 
 Functions take and return points (n, 4) float32: x, y, z [m] about the sensor, remission in 0..1, finite; they never
 modify their input. The rows keep their order, and lost returns are left out. Only beams that had a return in clear air
-can have one of a drop: the directions of the others are not in a scan.
+can have one of a drop: the directions of the others are not in a scan. A number out of its range is an OptionError.
 
 Drops and flakes: the sizes of Marshall and Palmer (1948) and Gunn and Marshall (1958), and which of them outshines the
 target, after Kilic et al., "Lidar Light Scattering Augmentation (LISA)", 2021. Attenuation in rain: Goodin et al.,
@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.points import Floats, Floats32, Points
+from .scene import LEAST, NUMBERS
 
 DIVERGENCE_RAD = 3e-3  # of the beam
 MAX_RANGE_M = 120.0  # of the sensor
 DROP_REMISSION = 0.02  # of water and ice at normal incidence
 LEAST_REMISSION, LEAST_OF_DROP = 0.05, 0.9  # of what a sensor sees at its longest range; after LISA for drops
+_RATES_MM_H = (0.001, 1e4)  # without rain, a scan is of clear air
 _TARGET = 1e-6 / math.pi  # differential reflectivity of a hard target (Hahner et al.)
 _PULSE_S, _LIGHT_M_PER_S = 20e-9, 299792458.0
 _CROSSOVER_M = (0.9, 1.0)  # between which the receiver begins to see the beam
@@ -30,6 +32,9 @@ _CROSSOVER_M = (0.9, 1.0)  # between which the receiver begins to see the beam
 
 def dirty(points: Points, left_deg: float, right_deg: float, lost: float = 1.0, *, seed: int = 0) -> Floats32:
     """Dirt on the window from an azimuth to another one on its right, which keeps a share of the returns away."""
+    for name, number_deg in (("left_deg", left_deg), ("right_deg", right_deg)):
+        NUMBERS.number(name, number_deg)
+    NUMBERS.number("lost", lost, 0.0, 1.0)
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     behind = (left_deg - azimuth) % 360.0 <= (left_deg - right_deg) % 360.0
     return points[~(behind & (np.random.default_rng(seed).random(len(points)) < lost))].astype(np.float32)
@@ -37,12 +42,14 @@ def dirty(points: Points, left_deg: float, right_deg: float, lost: float = 1.0, 
 
 def rain(points: Points, rate_mm_h: float, *, seed: int = 0) -> Floats32:
     """Rain: drops in the beams, and lost returns."""
+    NUMBERS.number("rate_mm_h", rate_mm_h, *_RATES_MM_H)
     slope, per_m = 4.1 * rate_mm_h**-0.21, 0.01 * rate_mm_h**0.6
     return _fallen(points, (8000.0, slope, per_m), seed)
 
 
 def snow(points: Points, rate_mm_h: float, *, seed: int = 0) -> Floats32:
     """Snow, by its rate as water: flakes in the beams, and lost returns."""
+    NUMBERS.number("rate_mm_h", rate_mm_h, *_RATES_MM_H)
     n0, slope = 7.6e3 * rate_mm_h**-0.87, 2.55 * rate_mm_h**-0.48
     # The cross-sections of all flakes take from the beam: pi/4 times the second moment of their sizes.
     per_m = math.pi / 4.0 * 2.0 * n0 / slope**3 * 1e-6
@@ -53,6 +60,9 @@ def cloud(
     points: Points, center_m: tuple[float, float, float], radius_m: float, per_m: float, *, seed: int = 0
 ) -> Floats32:
     """A ball of dust, spray or exhaust: a beam through it returns from inside with this probability a meter."""
+    NUMBERS.numbers("center_m", center_m, 3)
+    NUMBERS.number("radius_m", radius_m, 0.0)
+    NUMBERS.number("per_m", per_m, LEAST)
     rng, ranges, rays = _beams(points, seed)
     along = rays @ np.array(center_m)
     half = np.sqrt(np.maximum(radius_m**2 - (np.dot(center_m, center_m) - along**2), 0.0))
@@ -63,6 +73,7 @@ def cloud(
 
 def fog(points: Points, visibility_m: float, *, seed: int = 0) -> Floats32:
     """Fog by its visibility (meteorological optical range): attenuated returns, and those of the fog itself."""
+    NUMBERS.number("visibility_m", visibility_m, 1.0)
     rng, ranges, rays = _beams(points, seed)
     per_m, backscatter = math.log(20.0) / visibility_m, 0.046 / visibility_m
     reach, time = np.arange(0.5, 30.0, 0.1), np.linspace(0.0, 2.0 * _PULSE_S, 161)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from edgeperc.simulation import weather
+from edgeperc import OptionError
+from edgeperc.simulation import random_scene, simulate, simulate_sequence, weather
+from edgeperc.simulation.camera import forward_camera
 from scenes import urban
 
 Points = NDArray[np.float32]
@@ -45,6 +49,24 @@ def test_any_scan_stays_one(points: Points, kind: str, strength: float) -> None:
     assert len(bad) <= len(points)
     assert np.isfinite(bad).all()
     np.testing.assert_array_equal(bad, KINDS[kind](points, strength, 3))
+
+
+@pytest.mark.parametrize("number", [0.0, -1.0, math.nan, "heavy"])
+def test_numbers_out_of_their_range_are_refused(number: Any) -> None:
+    """As of all simulations; they were complex, or divided by zero."""
+    scan, scene = np.ones((1, 4), np.float32), random_scene(0)
+    for name, simulate_it in {
+        "rate_mm_h": lambda: weather.rain(scan, number),
+        "rate_mm_h ": lambda: weather.snow(scan, number),
+        "visibility_m": lambda: weather.fog(scan, number),
+        "per_m": lambda: weather.cloud(scan, (8.0, 0.0, -1.0), 2.5, number),
+        "rate_hz": lambda: next(simulate_sequence(scene, "vlp-16", 1, number)),
+        "max_range_m": lambda: simulate(scene, "vlp-16", 0, max_range_m=number),
+        "duration_s": lambda: simulate(scene, "mid-360", 0, duration_s=number),
+        "fov_deg": lambda: forward_camera(fov_deg=number),
+    }.items():
+        with pytest.raises(OptionError, match=f"{name.strip()} is .*; expected a number from"):
+            simulate_it()
 
 
 @pytest.mark.parametrize("kind", ["rain", "snow", "fog", "cloud"])
