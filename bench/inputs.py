@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc import Box, PointsError, read_points
+from edgeperc import Box, PointsError, SensorError, read_points
+from edgeperc.cli.scans import sensor_in
+from edgeperc.preprocess.sensor_estimate import MOST_SCANS, has_enough_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.choices import AUTO_SENSOR
 from edgeperc.types.points import Floats32, Points
 from edgeperc.types.sensor import get_sensor
 
@@ -43,9 +46,12 @@ def raw(points: Points, sensor: str) -> Floats32:
     return points
 
 
-def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
-    """The user's scans: files, and all scan files of folders; raises PointsError where there is none."""
-    get_sensor(sensor)
+def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input, str]:
+    """The user's scans: files, and all scan files of folders; and their sensor, for a `Perceiver`: the given one, or of
+    "auto" the file of that which their points show. Raises PointsError where there is no scan, SensorError.
+    """
+    if sensor != AUTO_SENSOR:
+        get_sensor(sensor)
     files: list[Path] = []
     for path in paths:
         found = sorted(p for p in path.iterdir() if p.suffix.lower() in SCAN_SUFFIXES) if path.is_dir() else [path]
@@ -54,7 +60,16 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
         files += found
     scans = [np.ascontiguousarray(read_points(file)) for file in files]
     source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
-    return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), sensor)
+    name = sensor
+    if sensor == AUTO_SENSOR:
+        enough = [scan for scan in scans if has_enough_points(scan)][:MOST_SCANS]
+        if not enough:
+            raise SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
+        found = sensor_in(enough)
+        found.tell_doubt("warn")
+        name, sensor = found.profile.name, str(folder / "sensor.json")
+        Path(sensor).write_text(found.profile.to_json(), encoding="utf-8")
+    return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), name), sensor
 
 
 def store(folder: Path, name: str, points: Points) -> Path:

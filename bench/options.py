@@ -13,8 +13,8 @@ from edgeperc.cli.output import in_options
 from edgeperc.errors import ProviderError
 from edgeperc.inference.providers import PROVIDERS, check_names
 from edgeperc.system.names import nearest
+from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR, PRECISIONS
 from edgeperc.types.choices import DEFAULT_MODELS as DEFAULT
-from edgeperc.types.choices import PRECISIONS
 
 SINGLE_STREAM = "single-stream"
 
@@ -45,8 +45,12 @@ def _add_shared(add: Options, groups: Sequence[str]) -> None:
             f"repeated (default: {', '.join(DEFAULT)})",
             action="append",
         )
-        sensor = "a name that 'edgeperc sensors' lists, or a .json file (default: %(default)s)"
-        add("--sensor NAME", f"the sensor that recorded the scans: {sensor}", default="hdl-64e")
+        # Scans of one's own may be of another sensor: as that of KITTI, they would be filled or thinned otherwise.
+        sensor, default = "a name that 'edgeperc sensors' lists, or a .json file (default: %(default)s)", DEFAULT_SENSOR
+        if "scans" in groups:
+            sensor = f"found in the points of --input (auto, the default; {DEFAULT_SENSOR} is simulated), or a name "
+            sensor, default = f"{sensor}that 'edgeperc sensors' lists, or a .json file", AUTO_SENSOR
+        add("--sensor NAME", f"the sensor that recorded the scans: {sensor}", default=default)
     if "scans" in groups:
         files = "measure with these scan files, or all scan files of these folders (default: simulated scans)"
         add("--input SCANS...", files, type=Path)

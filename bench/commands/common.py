@@ -13,6 +13,7 @@ from edgeperc.cli.output import lines_last, make_places
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
 from edgeperc.system.machine import fingerprint
+from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from edgeperc.zoo import DEFAULT
 
 from .. import context, plots
@@ -70,12 +71,15 @@ def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dic
 
 
 def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:
-    """Write the scans of ``--input`` or ``--scans`` to files in ``folder``, and record them in the report."""
+    """Write the scans of ``--input`` or ``--scans`` to files in ``folder``, and record them in the report;
+    ``--sensor auto`` becomes their sensor.
+    """
     from .. import inputs
 
     if arguments.input:
-        scans = inputs.read_input(folder, arguments.input, arguments.sensor)
+        scans, arguments.sensor = inputs.read_input(folder, arguments.input, arguments.sensor)
     else:
+        arguments.sensor = DEFAULT_SENSOR if arguments.sensor == AUTO_SENSOR else arguments.sensor
         live.note(f"simulating {arguments.scans} scans")
         scans = inputs.simulated_input(folder, arguments.scans, arguments.sensor)
     document["input"] = scans.record

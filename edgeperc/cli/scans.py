@@ -196,7 +196,7 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
 
 def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorEstimate | None:
     """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
-    from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor, has_enough_points
+    from ..preprocess.sensor_estimate import MOST_SCANS, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
     scans: list[Floats32] = []
@@ -207,9 +207,13 @@ def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorE
             scans.extend(points for _, points in read if has_enough_points(points))
         if len(scans) >= MOST_SCANS:
             break
-    if not scans:
-        return None
-    scans = scans[:MOST_SCANS]
+    return sensor_in(scans[:MOST_SCANS]) if scans else None
+
+
+def sensor_in(scans: Sequence[Floats32]) -> SensorEstimate:
+    """The sensor of a few scans with enough points, which some of them may not tell. Raises SensorError."""
+    from ..preprocess.sensor_estimate import estimate_sensor
+
     found: list[SensorEstimate] = []
     unknown: list[SensorError] = []
     # One of them may not tell, and hide what the others tell.
