@@ -95,7 +95,12 @@ def add_parser(commands: Commands) -> None:
 
 
 def _mounted(text: str) -> tuple[float, float, float]:
-    height_m, roll_deg, pitch_deg = (finite_number(part) for part in text.split(","))
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r:.60}; expected height [m], roll and pitch [deg] with commas between them, such as 1.73,5,-4"
+        )
+    height_m, roll_deg, pitch_deg = map(finite_number, parts)
     return height_m, roll_deg, pitch_deg
 
 
