@@ -542,7 +542,7 @@ class Perceiver:
         with self._calls.one():
             watch = Stopwatch()
             if scan is None:
-                perception = Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
+                perception = Perception(0, 0, None, None, (), watch.ms, dict(self.providers), (), stamp_s)
             else:
                 if not self._is_sensor_known and len(scan):
                     self._find_sensor(scan)
@@ -642,8 +642,8 @@ class Perceiver:
             points=parts.points,
             top_view=parts.top_view,
             boxes=self._frame.boxes_back(parts.boxes),
-            stage_ms=MappingProxyType(watch.ms),
-            providers=self.providers,
+            stage_ms=watch.ms,
+            providers=dict(self.providers),
             fitness=fitness,
             stamp_s=stamp_s,
             mounting=self._mounting,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from types import MappingProxyType
+from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -510,14 +509,6 @@ class Perception:
             "sensor_health": self.health.to_dict(),
         }
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """For pickles and copies: a read-only view of a mapping has neither."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return _with_views, (values | {name: dict(values[name]) for name in _VIEWS},)
-
-
-_VIEWS = ("stage_ms", "providers")
-
 
 def scan_of(perception: Perception, points: ArrayLike) -> Points:
     """The scan that was perceived, as points; PointsError if it is another."""
@@ -543,7 +534,3 @@ def _required(part: _Part | None, lacks: str, model: str, also: str = "") -> _Pa
             f"Perceiver {also}".rstrip()
         )
     return part
-
-
-def _with_views(values: dict[str, Any]) -> Perception:
-    return Perception(**values | {name: MappingProxyType(values[name]) for name in _VIEWS})
