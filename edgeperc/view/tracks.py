@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ _WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
 # Values of a pixel of a flattened scan: 0 empty, 1 road, 2 to 4 a background point by height, from 5 a class.
 _ROAD, _POINT, _CLASS = 1, 2, 5
 _OTHER = _CLASS + len(CLASS_COLORS)
+_AT_ONCE = 50  # pictures in memory, 0.6 MB each: 3,000 took 3 GB
 
 
 def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
@@ -124,8 +125,6 @@ def draw_tracks(
         The file cannot be written.
     """
     require("PIL", "view", "Drawing an animation", package="pillow")
-    from PIL import Image, ImageDraw, ImageFont
-
     if len(scans) < 2:
         raise TrackingError(
             f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "
@@ -134,13 +133,39 @@ def draw_tracks(
     for given, what in ((under, "flattened scans"), (mountings, "mountings")):
         if given and len(given) != len(scans):
             raise TrackingError(f"got {len(given)} {what} with tracks of {len(scans)}; expected one for each")
-    fonts = {size: ImageFont.load_default(_FINE * size) for size in (13, 14, 17)}
-    palette, labels = _palette(Image), {label for scan in scans for label in scan.labels}
-    trails: dict[int, list[tuple[float, float, float, float]]] = {}
-    pictures: list[Any] = []
     times_s = [0.0]
     for before, after in pairwise(scans):
         times_s.append(times_s[-1] + elapsed_s(before.stamp_s, after.stamp_s))
+    lasted = [max(20, round(1e3 * (after - before))) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
+    pictures = _pictures(scans, times_s, under, mountings, title or "Tracks", tail_s)
+    stream = io.BytesIO()
+    for begin in range(0, len(scans) - 1, _AT_ONCE):
+        end = begin + _AT_ONCE if begin + _AT_ONCE < len(scans) - 1 else len(scans)  # no part has a single picture
+        part, first = io.BytesIO(), next(pictures)
+        how: Any = {"duration": lasted[begin:end], "loop": 0, "optimize": False}
+        first.save(part, "GIF", save_all=True, append_images=islice(pictures, end - begin - 1), **how)
+        content = part.getvalue()[:-1]  # without the trailer
+        stream.write(content[content.index(b"!\xf9\x04", 13 + 3 * 256) if begin else 0 :])
+    stream.write(b";")
+    if path is not None:
+        write_atomic(path, stream.getvalue())
+    return stream.getvalue()
+
+
+def _pictures(
+    scans: Sequence[Tracks],
+    times_s: Sequence[float],
+    under: Sequence[bytes],
+    mountings: Sequence[Mounting],
+    title: str,
+    tail_s: float,
+) -> Iterator[Any]:
+    """The pictures of `draw_tracks`, all with one palette."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    fonts = {size: ImageFont.load_default(_FINE * size) for size in (13, 14, 17)}
+    palette, labels = _palette(Image), {label for scan in scans for label in scan.labels}
+    trails: dict[int, list[tuple[float, float, float, float]]] = {}
     for k, (tracks, time_s) in enumerate(zip(scans, times_s, strict=True)):
         flat = zlib.decompress(under[k]) if under else bytes(_HEIGHT * _WIDTH)
         layer = _layer_colors()[np.frombuffer(flat, np.uint8).reshape(_HEIGHT, _WIDTH)]
@@ -162,14 +187,8 @@ def draw_tracks(
             _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R @ frame.R.T + frame.t)
         _write_names(pen, drawn, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
-        _write_frame(pen, title or "Tracks", facts, labels, fonts, tail_s)
-        pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
-    lasted = [max(20, round(1e3 * (after - before))) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
-    stream = io.BytesIO()
-    pictures[0].save(stream, "GIF", save_all=True, append_images=pictures[1:], duration=lasted, loop=0, optimize=False)
-    if path is not None:
-        write_atomic(path, stream.getvalue())
-    return stream.getvalue()
+        _write_frame(pen, title, facts, labels, fonts, tail_s)
+        yield picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 def _as_the_vehicle_sees(track: Track, frame: ModelFrame) -> Track:

@@ -286,7 +286,7 @@ def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
     (calibs / "b.txt").write_text(CALIBRATION)
     one = written(tmp_path / "each", "kitti", perceived("b.bin"), calib=calibs)
     assert (one / "calib/b.txt").read_text() == CALIBRATION
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(CalibrationError, match="add it, pass one file for all scans"):
         written(tmp_path / "none", "kitti", perceived("c.bin"), calib=calibs)
     values = dict(line.split(": ") for line in CALIBRATION.splitlines())
     (calibs / "calib_cam_to_cam.txt").write_text(f"R_rect_00: {values['R0_rect']}\nP_rect_02: {values['P2']}\n")

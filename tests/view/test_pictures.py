@@ -591,7 +591,9 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser:
 
 
 @pytest.mark.parametrize("mounting", [MODEL_MOUNTING, Mounting(2.1, 180.0, 3.0, -90.0)])
-def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path: Path, mounting: Mounting) -> None:
+def test_tracks_lie_on_the_scan(
+    scan: np.ndarray, perception: Perception, tmp_path: Path, mounting: Mounting, monkeypatch: pytest.MonkeyPatch
+) -> None:
     image = pytest.importorskip("PIL.Image")
     tracker, frame = Tracker(), ModelFrame(mounting)
     cars = frame.boxes_back(replace(CAR, center=(20.0 + 0.8 * k, 3.0, -0.9), yaw=0.0) for k in range(6))
@@ -609,6 +611,8 @@ def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_pa
             return np.asarray(animation.convert("RGB")).astype(np.int16)
 
     with_scan, alone = last(content), last(bare)
+    monkeypatch.setattr("edgeperc.view.tracks._AT_ONCE", 4)  # a long drive is written in parts
+    np.testing.assert_array_equal(last(draw_tracks(tracks, mountings=mountings, title="a drive")), alone)
     assert near(alone, "car").sum() > 150  # the box, at x = 24, y = 3: pixel 460, 294
     assert near(alone[270:318, 420:500], "car").sum() > 100
     road = np.abs(with_scan - alone).sum(axis=2)[44:604] > 30
