@@ -433,15 +433,19 @@ def _add_agree(command: Command) -> None:
     add("--kitti KITTI", "root of a KITTI object set", type=Path)
     add("--semantickitti SEMANTICKITTI", "root of SemanticKITTI, for the road", type=Path)
     add("--camvid CAMVID", f"{CAMVID}; for a network of a camera", type=Path)
-    add("--split SPLIT", "drives of the KITTI set, or images (default: validation)", default="validation")
+    labeled = "labeled scans of any sensor: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
+    add("--labeled FOLDER[:LAYOUT]", labeled, action="append", default=[])
+    add("--split SPLIT", "drives of the scans, or images (default: validation)", default="validation")
     add("--scans N", "at most N scans of each set (default: all)", type=positive)
 
 
 def _agree(args: argparse.Namespace) -> None:
+    from edgeperc.datasets.scan_folder import ScanFolder
+
     from .release.agree import agree, summary
 
     how = keywords(args, "kitti", "semantickitti", "camvid", "split", n_scans="scans")
-    measured = agree(args.models, **how)
+    measured = agree(args.models, labeled=[ScanFolder.parse(text) for text in args.labeled], **how)
     for line in summary(measured):
         print_line(line)
     if "bf16" not in measured:

@@ -158,18 +158,18 @@ class Judge:
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive. Raises SplitError."""
-        truth, perception, scan_boxes = self._perceive_frame(frame)
+        truth, perception, scan_boxes = self.perceive_frame(frame)
         return self.compare(truth, perception, scan_boxes)
 
     def record_boxes(self, frame: ScanFrame) -> Record:
         """As `record_scan`, of the boxes alone: `kitti_ap` and `center_ap`."""
-        truth, perception, scan_boxes = self._perceive_frame(frame)
+        truth, perception, scan_boxes = self.perceive_frame(frame)
         tallies: dict[tuple[str, ...], Any] = {}
         if frame.boxes is not None:
             self._count_ap(tallies, truth, perception.boxes, scan_boxes)
         return Record(truth.name, truth.drive, tallies)
 
-    def _perceive_frame(self, frame: ScanFrame) -> tuple[Truth, Perception, Sequence[Box]]:
+    def perceive_frame(self, frame: ScanFrame) -> tuple[Truth, Perception, Sequence[Box]]:
         """Truth and perception of a scan in the frame of the models, and its boxes in that of the scan."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if frame.drive != self.drive:

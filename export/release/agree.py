@@ -19,6 +19,7 @@ import onnxruntime
 from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
 from edgeperc.datasets.layout import class_number
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.camvid import check_classes
 from edgeperc.evaluation.judge import Judge, Perceiving
@@ -32,7 +33,9 @@ from edgeperc.perceiver import Perceiver
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.system.machine import cpu_features, cpu_model
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.perception import Box, Perception
 from edgeperc.types.points import Bytes, Floats32
+from edgeperc.types.sensor import SensorProfile
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
 from .object_parity import TOP_VIEW, candidate_inputs, objects_of
@@ -58,11 +61,13 @@ def agree(
     kitti: Path | None,
     semantickitti: Path | None = None,
     camvid: Path | None = None,
+    labeled: Sequence[ScanFolder] = (),
     split: str = "validation",
     n_scans: int | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Measure every precision that the files of one network can run in on labeled scans or images, at most ``n_scans``
-    of each set, and write the record into their cards. Raises ModelError, PointsError, SplitError.
+    of each set, and write the record into their cards; ``labeled``: sets of any sensor. Raises ModelError, PointsError,
+    SplitError.
     """
     variants = {variant.precision: variant for model in models for variant in resolve(model)}
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
@@ -89,16 +94,22 @@ def agree(
             raise PointsError("objects are compared on KITTI's boxes; name a KITTI object set")
         measure = partial(_measure_objects, objects=KittiObjects(kitti))
     else:
-        if lacking := [name for name in fp32.card.classes[1:] if class_number(name) == IGNORE]:
+        of_sets = {name for each in labeled for name in (*each.layout.boxes.values(), *each.layout.points.values())}
+        shown = {class_number(name, fp32.card.classes) for name in of_sets}
+        classes = [name for k, name in enumerate(fp32.card.classes) if k and k not in shown]
+        if lacking := [name for name in classes if class_number(name) == IGNORE]:
             raise ModelError(
                 f"{fp32.name} has classes that no labels of KITTI show: {', '.join(lacking)}. What they lose cannot be "
-                "measured; ask for the precision by name where its results are good enough"
+                "measured; name a set that labels them, --labeled FOLDER, or ask for the precision by name where its "
+                "results are good enough"
             )
-        measure = partial(_measure, kitti=kitti, semantickitti=semantickitti)
+        measure = partial(_measure, kitti=kitti, semantickitti=semantickitti, labeled=labeled)
     measured = {precision: measure(variant, precision, split, n_scans) for precision, variant in runs.items()}
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
+    options += [f"--labeled {each.layout.name.upper()}" for each in labeled]
+    options += [f"--split {split}"] * (bool(labeled) and kitti is None)
     command = " ".join(["edgeperc-export agree", fp32.name, *options])
     records = {precision: record_of(each, measured["fp32"], command) for precision, each in measured.items()}
     for variant in variants.values():
@@ -145,29 +156,49 @@ def record_of(own: Measured, fp32: Measured, command: str) -> dict[str, Any]:
 
 
 def _measure(
-    variant: Variant, precision: str, split: str, n_scans: int | None, *, kitti: Path | None, semantickitti: Path | None
+    variant: Variant,
+    precision: str,
+    split: str,
+    n_scans: int | None,
+    *,
+    kitti: Path | None,
+    semantickitti: Path | None,
+    labeled: Sequence[ScanFolder],
 ) -> Measured:
-    judge = Judge([variant.path], Perceiving(boxes_from="network"))
-    by = _engine(judge.perceive.sessions[0], precision)
+    by = ""
 
-    def truths() -> Iterator[tuple[str, Truth]]:
+    def judge_of(sensor: SensorProfile | None = None) -> Judge:
+        nonlocal by
+        judge = Judge([variant.path], Perceiving(boxes_from="network"), sensor=sensor)
+        by = _engine(judge.perceive.sessions[0], precision)
+        return judge
+
+    def answers() -> Iterator[tuple[str, Judge, Truth, Perception, Sequence[Box] | None]]:
+        judge = judge_of()
         if kitti is not None:
             objects = KittiObjects(kitti)
             for name in _spread(objects.names(split), n_scans):
-                yield "real", judge.kitti(objects.frame(name))
+                truth = judge.kitti(objects.frame(name))
+                yield "real", judge, truth, judge.perceive(truth.points), None
         if semantickitti is not None and judge.from_above is not None:
             roads = SemanticKitti(semantickitti)
             for name in _spread(roads.names("all"), n_scans):
-                yield "road", judge.semantickitti(roads.frame(name))
+                truth = judge.semantickitti(roads.frame(name))
+                yield "road", judge, truth, judge.perceive(truth.points), None
+        for folder in labeled:
+            judge = judge_of(folder.layout.sensor)
+            for name in _spread(folder.names(split), n_scans):
+                yield folder.layout.name, judge, *judge.perceive_frame(folder.frame(name))
 
     records: dict[str, list[Record]] = {}
     labels = []
-    for block, truth in truths():
-        found = judge.perceive(truth.points)
-        records.setdefault(block, []).append(judge.compare(truth, found)[0])
+    for block, judge, truth, found, boxes in answers():
+        records.setdefault(block, []).append(judge.compare(truth, found, boxes)[0])
         labels.append(found.points.labels if found.points is not None else found.require_top_view().labels.ravel())
     if not labels:
-        raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
+        raise PointsError(
+            f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set, or a labeled one"
+        )
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]
     ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]

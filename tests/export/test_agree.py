@@ -14,10 +14,14 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.layout import ScanLayout
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import CardMismatchError, ModelError, PointsError
 from edgeperc.inference.session import Session
 from edgeperc.system.machine import cpu_features
 from edgeperc.types.card import ModelCard
+from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import BF16_FEATURES, model_path, resolve
 from edgeperc_export.release import agree as module
 from edgeperc_export.release.agree import agree, summary
@@ -100,5 +104,13 @@ def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Pa
     fp32, int8 = (Session(path, "cpu").card for path in paths)
     assert fp32.precisions == {precision: records[precision] for precision in records if precision != "int8"}
     assert int8.precisions == {"int8": records["int8"]}
+    names = KittiObjects(kitti_root).names("test")[:2]
+    boxes = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "cyclist", "*": "ignore"}
+    splits = {"test": tuple(names), "train": ("*",)}
+    layout = ScanLayout("own", get_sensor("hdl-64e"), boxes, {}, box_format="kitti", drives="scan", splits=splits)
+    own = agree(paths, kitti=None, labeled=[ScanFolder(kitti_root / "training", layout)], split="test")["int8"]
+    assert own["command"] == "edgeperc-export agree pointseg --labeled OWN --split test"
+    assert own["n_scans"] == 2
+    assert own["label_agreement"] > 0.99
     for variant, path in zip(resolve("pointseg"), paths, strict=True):
         assert onnx.load(path).graph == onnx.load(variant.path).graph
