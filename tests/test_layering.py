@@ -85,9 +85,9 @@ FLOORS = {
         readers.captures
         records
         simulation.ray_draws
-        simulation.raycast simulation.weather
+        simulation.raycast
         simulation.scene simulation.shapes
-        simulation.vehicles
+        simulation.vehicles simulation.weather
         simulation.people
         simulation.street
         simulation.camera simulation.roadside

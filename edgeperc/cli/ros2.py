@@ -231,4 +231,7 @@ def _perceiver(arguments: argparse.Namespace, sensor: Any) -> Perceiver:
     check_sensor(arguments)
     mounted = with_mounting(sensor, arguments)
     mismatch: Any = "warn" if arguments.anyway else "refuse"
-    return make_perceiver(arguments, sensor=mounted, on_mismatch=mismatch, adapt=arguments.adapt)
+    made = make_perceiver(arguments, sensor=mounted, on_mismatch=mismatch, adapt=arguments.adapt)
+    if made.sensor.pattern is not None:
+        print_line(f"the points of the last {made.sensor.pattern.accumulate_s:g} s are taken as seen from one place")
+    return made

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +37,7 @@ __all__ = ["PerceptionNode"]
 USUAL_OUTPUTS = (*messages.OUTPUTS, messages.GROUND_POINTS, messages.OBSTACLE_POINTS)
 """What a node publishes unless it is told otherwise."""
 REPORT_EVERY_S = 1.0
+_MOST_GATHERED = 200  # clouds: more than come in the time of a scan
 _LATENCIES = 1000  # of the last answers, for the percentiles
 # No scan heals what is wrong with the installation or the options.
 _FATAL = (MissingExtraError, ModelError, OptionError, ProviderError)
@@ -47,7 +49,8 @@ class PerceptionNode:
     Iterate over it to run it. A cloud that cannot be read or perceived, however damaged, is an error in the diagnostics
     and an item of the iteration; the node goes on. Answers have the stamp of their cloud; if it is 0, that of this
     computer's clock. Clouds that come late or twice are answered without tracks, and if the stamps jump, as when a
-    recording begins again, tracking begins anew (`edgeperc.Tracker`).
+    recording begins again, tracking begins anew (`edgeperc.Tracker`). Those of a sensor that does not spin are gathered
+    over the time that its profile says, as of one that stands still.
 
     It subscribes with the quality of service of sensor data. It publishes ``PREFIX/NAME`` for each of its outputs, each
     only while somebody subscribes, and ``/diagnostics`` once a second, all reliably: best-effort subscribers receive
@@ -123,6 +126,9 @@ class PerceptionNode:
         self._cloud_frame = ""  # of the cloud that the perceiver was made for
         self._stamp_ns: int | None = None
         self._points: Floats32 | None = None
+        self._n_earlier = 0  # of these points: those of clouds before the newest
+        self._gather_s: float | None = None  # time over which scans are gathered; None: not known yet, 0: not at all
+        self._recent: deque[bytes] = deque(maxlen=_MOST_GATHERED)
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
         self._unplaced = ""
@@ -211,6 +217,8 @@ class PerceptionNode:
 
     def _receive(self, data: bytes) -> None:
         if self._state == "active":
+            if self._gather_s != 0.0:
+                self._recent.append(data)
             self._waiting.put(data)
 
     @property
@@ -281,6 +289,8 @@ class PerceptionNode:
         if perceiver is None:
             perceiver = self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
             self._cloud_frame = cloud.header.frame_id
+            pattern = perceiver.sensor.pattern
+            self._gather_s = 0.0 if pattern is None else pattern.accumulate_s
         if cloud.header.frame_id != self._cloud_frame:
             raise PointsError(
                 f"the cloud has the frame {cloud.header.frame_id!r}, and the first one {self._cloud_frame!r}: it is of "
@@ -288,9 +298,25 @@ class PerceptionNode:
             )
         stamp_ns = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec or time.time_ns()
         self._messages.frame_id = self._frame_id or cloud.header.frame_id or "lidar"
+        if self._gather_s:
+            earlier = [*self._earlier(data, stamp_ns, self._gather_s)]
+            self._n_earlier = sum(map(len, earlier))
+            points = np.concatenate([*earlier, points])
         perception = perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
         self._points, self._stamp_ns, self._cloud, self._sensor = points, stamp_ns, cloud, perceiver.sensor
         return perception
+
+    def _earlier(self, newest: bytes, stamp_ns: int, gather_s: float) -> Iterator[Floats32]:
+        """Points of the clouds that came in the time before the newest, dropped ones, too: `edgeperc.accumulate`."""
+        for data in takewhile(lambda each: each is not newest, tuple(self._recent)):
+            try:
+                cloud = self._messages.decode(data, messages.CLOUD)
+                stamp = cloud.header.stamp
+                is_recent = 0 < stamp_ns - (stamp.sec * 10**9 + stamp.nanosec) < gather_s * 1e9
+                if is_recent and cloud.header.frame_id == self._cloud_frame:
+                    yield cloud_points(cloud)
+            except PointsError:  # which is told of a cloud that is the newest
+                continue
 
     def _publish(self, answer: Answer) -> PerceivedScan:
         assert self._points is not None
@@ -313,7 +339,7 @@ class PerceptionNode:
             if name in (messages.GROUND_POINTS, messages.OBSTACLE_POINTS):
                 parts = parts or split_points(scan.perception, scan.points, sensor=scan.sensor)
                 mask = parts.ground if name == messages.GROUND_POINTS else parts.obstacle
-                message = self._messages.part(scan, self._cloud, mask, self._stamp_ns)
+                message = self._messages.part(scan, self._cloud, mask[self._n_earlier :], self._stamp_ns)
             else:
                 message = getattr(self._messages, name)(scan, self._stamp_ns)
             output.publish(self._messages.encode(message))

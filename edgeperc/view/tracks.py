@@ -37,7 +37,7 @@ _WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
 # Values of a pixel of a flattened scan: 0 empty, 1 road, 2 to 4 a background point by height, from 5 a class.
 _ROAD, _POINT, _CLASS = 1, 2, 5
 _OTHER = _CLASS + len(CLASS_COLORS)
-_AT_ONCE = 50  # pictures in memory, 0.6 MB each: 3,000 took 3 GB
+AT_ONCE = 50  # pictures in memory, 0.6 MB each: 3,000 took 3 GB
 
 
 def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
@@ -139,8 +139,8 @@ def draw_tracks(
     lasted = [max(20, round(1e3 * (after - before))) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
     pictures = _pictures(scans, times_s, under, mountings, title or "Tracks", tail_s)
     stream = io.BytesIO()
-    for begin in range(0, len(scans) - 1, _AT_ONCE):
-        end = begin + _AT_ONCE if begin + _AT_ONCE < len(scans) - 1 else len(scans)  # no part has a single picture
+    for begin in range(0, len(scans) - 1, AT_ONCE):
+        end = begin + AT_ONCE if begin + AT_ONCE < len(scans) - 1 else len(scans)  # no part has a single picture
         part, first = io.BytesIO(), next(pictures)
         how: Any = {"duration": lasted[begin:end], "loop": 0, "optimize": False}
         first.save(part, "GIF", save_all=True, append_images=islice(pictures, end - begin - 1), **how)

@@ -30,6 +30,7 @@ from edgeperc.ros2.graph import full_name
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
 from edgeperc.ros2.odometry import ODOMETRY, Rolling
+from edgeperc.types.sensor import get_sensor
 from waiting import TIMEOUT_S, until
 
 SLOW_HZ = 0.01  # no answer is late
@@ -286,6 +287,18 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
     )
     assert (len(first), len(tracked), len(twice)) == (0, 1, 1)
     assert [found[0].id for found in (tracked, twice)] == ["1", ""]
+
+
+def test_clouds_of_a_sensor_that_does_not_spin_are_gathered() -> None:
+    """As those of a file are: alone, each has a part of the points that its profile says."""
+    perceive = Perceive()
+    perceive.sensor = get_sensor("mid-360").accumulated(0.2)
+    clouds = [cloud(POINTS + k, 10**8 * stamp) for k, stamp in enumerate((10, 11, 12, 5))]
+    graph, outcomes = answered(clouds, perceive)
+    assert [scan.perception.n_points for scan in outcomes] == [3, 6, 6, 3]
+    np.testing.assert_array_equal(outcomes[2].points, np.concatenate([POINTS + 1, POINTS + 2]))
+    parts = [MESSAGES.decode(data, CLOUD) for data in graph.published["/edgeperc/ground_points"]]
+    assert all(part.width <= len(POINTS) for part in parts)
 
 
 def test_a_cloud_of_another_frame_is_an_error_and_the_first_sensor_goes_on() -> None:

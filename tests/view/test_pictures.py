@@ -611,7 +611,7 @@ def test_tracks_lie_on_the_scan(
             return np.asarray(animation.convert("RGB")).astype(np.int16)
 
     with_scan, alone = last(content), last(bare)
-    monkeypatch.setattr("edgeperc.view.tracks._AT_ONCE", 4)  # a long drive is written in parts
+    monkeypatch.setattr("edgeperc.view.tracks.AT_ONCE", 4)  # a long drive is written in parts
     np.testing.assert_array_equal(last(draw_tracks(tracks, mountings=mountings, title="a drive")), alone)
     assert near(alone, "car").sum() > 150  # the box, at x = 24, y = 3: pixel 460, 294
     assert near(alone[270:318, 420:500], "car").sum() > 100
