@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc import Box, PointsError, SensorError, read_points
+from edgeperc import Box, PointsError, read_points
 from edgeperc.cli.scans import sensor_in
 from edgeperc.preprocess.sensor_estimate import MOST_SCANS, has_enough_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
-from edgeperc.types.choices import AUTO_SENSOR
+from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from edgeperc.types.points import Floats32, Points
 from edgeperc.types.sensor import get_sensor
 
@@ -63,12 +63,13 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input,
     name = sensor
     if sensor == AUTO_SENSOR:
         enough = [scan for scan in scans if has_enough_points(scan)][:MOST_SCANS]
-        if not enough:
-            raise SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
-        found = sensor_in(enough)
-        found.tell_doubt("warn")
-        name, sensor = found.profile.name, str(folder / "sensor.json")
-        Path(sensor).write_text(found.profile.to_json(), encoding="utf-8")
+        profile = get_sensor(DEFAULT_SENSOR)  # as `edgeperc run` takes for so few points
+        if enough:
+            estimate = sensor_in(enough)
+            estimate.tell_doubt("warn")
+            profile = estimate.profile
+        name, sensor = profile.name, str(folder / "sensor.json")
+        Path(sensor).write_text(profile.to_json(), encoding="utf-8")
     return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), name), sensor
 
 

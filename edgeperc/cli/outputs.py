@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -12,8 +11,6 @@ from pathlib import Path
 from ..system.remote import Remote
 from .scans import is_recording
 from .sinks import wanted_sinks
-
-_NUMBERED = re.compile(r"\d{6,}\.bin")  # the file of ``--static`` of a scan in a capture
 
 
 def check_outputs(
@@ -49,7 +46,6 @@ def check_outputs(
     if arguments.static is not None:  # scans of a capture get numbers
         from ..sinks.static import file_name
 
-        _check_static(arguments, written_of, captures)
         names = {"000000.bin" if scan in captures else file_name(scan.name) for scan in written_of}
         outputs += [("--static", arguments.static / name) for name in sorted(names)]
     if arguments.labels_for == "cvat":
@@ -63,7 +59,7 @@ def check_outputs(
                 calibration_of(arguments.calib, scan.name)
     written: dict[str, str] = {}
     for option, file in outputs:
-        if _real(file) in sources and option != "--static":  # which refuses it scan by scan
+        if _real(file) in sources and option != "--static":  # which replaces none
             arguments.usage_error(
                 f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
             )
@@ -75,24 +71,6 @@ def check_outputs(
         other = written.setdefault(_real(file), option)
         if other != option:
             arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
-
-
-def _check_static(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
-    """Check that no file of ``--static`` replaces another scan of the run, which may not even have been read yet."""
-    from ..sinks.static import file_name
-
-    sources = {_real(scan) for scan in scans}
-    files = ((scan, _real(arguments.static / file_name(scan.name))) for scan in scans if scan not in captures)
-    replaced = {file for scan, file in files if file in sources and file != _real(scan)}
-    if captures:  # their scans get numbers, and nobody knows yet how many there are
-        folder = Path(_real(arguments.static))
-        beside = {source for source in sources if Path(source).parent == folder}
-        replaced |= {source for source in beside if _NUMBERED.fullmatch(Path(source).name)}
-    if replaced:
-        arguments.usage_error(
-            f"{min(replaced)} is one of the scans and would be overwritten by --static with another one; choose "
-            "another folder"
-        )
 
 
 def _check_drives(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:

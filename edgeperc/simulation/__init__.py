@@ -3,7 +3,7 @@
 `drawn` makes random scenes, and `layouts` makes scenes around real boxes, from the parts in
 `street`, `roadside`, `vehicles` and `people`, which consist of the primitives in `shapes`.
 `scene` turns a scene into a labeled scan with the ray-casting kernels of `raycast`. `samples` makes the scans for
-training and evaluation, with point labels from boxes as in KITTI.
+training and evaluation, with point labels from boxes as in KITTI. A number out of its range is an OptionError.
 """
 
 from .drawn import ENVIRONMENTS, random_scene

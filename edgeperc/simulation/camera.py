@@ -67,11 +67,6 @@ def forward_camera(
         Horizontal field of view [deg].
     at_m : tuple of 3 float
         Place of the camera in the frame of the LiDAR: x ahead, y left, z up [m]. By default as on KITTI's car.
-
-    Raises
-    ------
-    OptionError
-        A number is out of its range.
     """
     for name, pixels in (("width", width), ("height", height)):
         NUMBERS.whole(name, pixels, 1, 2**15)
@@ -109,8 +104,6 @@ def render(
     ------
     CalibrationError
         The camera is tilted by more than 20 degrees.
-    OptionError
-        ``max_range_m`` is not above 0.
     """
     NUMBERS.number("max_range_m", max_range_m, 0.1, math.inf)
     T_world_camera = np.asarray(T_world_sensor, np.float64) @ np.linalg.inv(calibration.T_camera_sensor)

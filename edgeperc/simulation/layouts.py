@@ -37,11 +37,6 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     Scene
         Its first objects are the ``boxes``, in order. They stand on the ground of the scene, so z
         differs slightly from the boxes.
-
-    Raises
-    ------
-    OptionError
-        ``mount_height_m`` is no number.
     """
     NUMBERS.number("mount_height_m", mount_height_m)
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))

@@ -257,8 +257,6 @@ def simulate(
     ------
     PointsError
         ``T_world_sensor`` is not a rotation and a translation, or tilts the sensor more.
-    OptionError
-        A number is out of its range.
     """
     NUMBERS.number("max_range_m", max_range_m, 0.1, math.inf)
     NUMBERS.number("start_s", start_s)
@@ -370,8 +368,6 @@ def simulate_sequence(
 
     Yields T_world_sensor: (4, 4) float64.
     Yields scan: ``scan.box_ids`` identify objects across scans.
-
-    Raises OptionError for a number out of its range, errors of `simulate`.
     """
     NUMBERS.whole("n_scans", n_scans, 0, 10**9)
     NUMBERS.number("rate_hz", rate_hz, LEAST, 1.0 / LEAST)

@@ -2,7 +2,7 @@
 
 Functions take and return points (n, 4) float32: x, y, z [m] about the sensor, remission in 0..1, finite; they never
 modify their input. The rows keep their order, and lost returns are left out. Only beams that had a return in clear air
-can have one of a drop: the directions of the others are not in a scan. A number out of its range is an OptionError.
+can have one of a drop: the directions of the others are not in a scan.
 
 Drops and flakes: the sizes of Marshall and Palmer (1948) and Gunn and Marshall (1958), and which of them outshines the
 target, after Kilic et al., "Lidar Light Scattering Augmentation (LISA)", 2021. Attenuation in rain: Goodin et al.,

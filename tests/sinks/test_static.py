@@ -174,33 +174,21 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
         assert shell.err("run", tmp_path / "drive", *wrong)
 
 
-@pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("a", "drive.pcap"), ("000001.csv", "a")])
-def test_no_scan_is_replaced_by_another_one(
-    paths: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
-) -> None:
-    monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Standing))
-    for folder in "ab":
-        (tmp_path / folder).mkdir()
-        POINTS.tofile(tmp_path / folder / "000001.bin")
-    (tmp_path / "drive.pcap").write_bytes(bytes(24))
-    (tmp_path / "000001.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")  # becomes 000001.bin
-    said = shell.err("run", *(tmp_path / path for path in paths), "--movable", "--static", tmp_path / "a")
-    assert "would be overwritten by --static with another one" in said
-    assert (tmp_path / "a/000001.bin").read_bytes() == POINTS.tobytes()
-
-
-@pytest.mark.parametrize("options", [("--static", "out", "--movable"), ("--labels-for", "kitti", "--out", "out")])
-def test_drives_whose_files_have_one_name_are_told_before_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell, options: tuple[str, ...]
+@pytest.mark.parametrize("paths", [("a", "b"), ("b", "a"), ("000001.csv", "a")])
+@pytest.mark.parametrize("options", ["--static a --movable", "--labels-for kitti --out out"])
+def test_scans_whose_files_have_one_name_are_told_before_the_run(
+    paths: tuple[str, str], options: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for folder in "ab":
         Path(folder).mkdir()
         POINTS.tofile(f"{folder}/000001.bin")
-    assert "the files of a/000001.bin and of b/000001.bin would both be" in shell.err("run", "a", "b", *options)
-    Path("calib").mkdir()
-    if options[0] == "--labels-for":
-        assert "calib/000001.txt, the calibration of 000001.bin" in shell.err("run", "a", *options, "--calib", "calib")
+    Path("000001.csv").write_text("x,y,z,intensity\n1,2,3,0.5\n")  # becomes 000001.bin
+    assert "would both be called 000001" in shell.err("run", *paths, *options.split())
+    assert Path("a/000001.bin").read_bytes() == POINTS.tobytes()
+    Path("calib").mkdir()  # of which each lacks its own
+    if "kitti" in options:
+        assert "calib/000001.txt, the calibration of" in shell.err("run", "b", *options.split(), "--calib", "calib")
 
 
 def sinks_of(folder: Path, *options: object) -> Sinks:
