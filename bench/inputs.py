@@ -18,7 +18,7 @@ from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from edgeperc.types.points import Floats32, Points
-from edgeperc.types.sensor import get_sensor
+from edgeperc.types.sensor import SENSORS, get_sensor
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,16 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input,
             raise PointsError(f"{path} holds no scan; expected files that end in {', '.join(SCAN_SUFFIXES)}")
         files += found
     scans = [np.ascontiguousarray(read_points(file)) for file in files]
+    enough = [scan for scan in scans if has_enough_points(scan)][:MOST_SCANS]
     source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
-    name = sensor
+    name = sensor = DEFAULT_SENSOR if sensor == AUTO_SENSOR and not enough else sensor  # as `edgeperc run` takes it
     if sensor == AUTO_SENSOR:
-        enough = [scan for scan in scans if has_enough_points(scan)][:MOST_SCANS]
-        profile = get_sensor(DEFAULT_SENSOR)  # as `edgeperc run` takes for so few points
-        if enough:
-            estimate = sensor_in(enough)
-            estimate.tell_doubt("warn")
-            profile = estimate.profile
-        name, sensor = profile.name, str(folder / "sensor.json")
-        Path(sensor).write_text(profile.to_json(), encoding="utf-8")
+        estimate = sensor_in(enough)
+        estimate.tell_doubt("warn")
+        name = sensor = estimate.profile.name
+        if estimate.profile not in SENSORS.values():
+            sensor = str(folder / f"{name}.json")
+            Path(sensor).write_text(estimate.profile.to_json(), encoding="utf-8")
     return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), name), sensor
 
 

@@ -43,20 +43,21 @@ def check_outputs(
         value = getattr(arguments, name)
         outputs += [(f"--{name}", value)] if isinstance(value, Path) else []
     written_of = [scan for scan in (images.values() if images else scans) if scan is not None]
-    if arguments.static is not None:  # scans of a capture get numbers
+    if arguments.static is not None:
         from ..sinks.static import file_name
 
-        names = {"000000.bin" if scan in captures else file_name(scan.name) for scan in written_of}
-        outputs += [("--static", arguments.static / name) for name in sorted(names)]
-    if arguments.labels_for == "cvat":
-        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
-    _check_drives(arguments, written_of, captures)
-    if arguments.labels_for is not None and arguments.calib is not None:
+        names = _names(arguments, "--static", {scan: file_name(_shown(scan, captures)) for scan in written_of})
+        outputs += [("--static", arguments.static / name) for name in names]
+    if arguments.labels_for is not None:
         from ..sinks.prelabels import calibration_of
+        from ..sinks.run_file import stem_of
 
-        for scan in written_of:
+        _names(arguments, "--labels-for", {scan: stem_of(_shown(scan, captures))[0] for scan in written_of})
+        for scan in written_of if arguments.calib is not None else ():
             if scan not in captures:
                 calibration_of(arguments.calib, scan.name)
+    if arguments.labels_for == "cvat":
+        outputs.append(("--labels-for", arguments.out / "annotations.zip"))
     written: dict[str, str] = {}
     for option, file in outputs:
         if _real(file) in sources and option != "--static":  # which replaces none
@@ -73,20 +74,21 @@ def check_outputs(
             arguments.usage_error(f"{other} and {option} both write {file}; choose another name for one of them")
 
 
-def _check_drives(arguments: argparse.Namespace, scans: Sequence[Path], captures: Collection[Path]) -> None:
-    """Check that no two scans have one name where files have those of their scans, before half of the run is lost."""
-    from ..sinks.run_file import stem_of
-    from ..sinks.static import file_name
+def _shown(scan: Path, captures: Collection[Path]) -> str:
+    """Name of a scan; those of a capture have numbers, and this is the first."""
+    return "000000" if scan in captures else scan.name
 
-    for option, name_of in (("static", file_name), ("labels_for", lambda name: stem_of(name)[0])):
-        named: dict[str, Path] = {}
-        for scan in scans if getattr(arguments, option) is not None else ():
-            name = name_of("000000" if scan in captures else scan.name)
-            if (other := named.setdefault(name, scan)) is not scan:
-                arguments.usage_error(
-                    f"--{option.replace('_', '-')}: the files of {other} and of {scan} would both be called {name}; "
-                    "run each drive by itself, with a folder of its own"
-                )
+
+def _names(arguments: argparse.Namespace, option: str, names: Mapping[Path, str]) -> Sequence[str]:
+    """The names of files that scans have, which differ: half of the run would be refused otherwise."""
+    scans: dict[str, Path] = {}
+    for scan, name in names.items():
+        if (other := scans.setdefault(name, scan)) is not scan:
+            arguments.usage_error(
+                f"{option}: the files of {other} and of {scan} would both be called {name}; run each drive by itself, "
+                "with a folder of its own"
+            )
+    return [*scans]
 
 
 def _real(path: Path) -> str:

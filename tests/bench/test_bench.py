@@ -553,7 +553,7 @@ HAS_EXPORT = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
 
 
 FEW = ["--model", "pointseg", "--provider", "cpu", "--precision", "fp32", "--threads", "1", "--repeats", "1"]
-FEW += ["--warm-up", "1", "--min-seconds", "0"]
+FEW += ["--warm-up", "1", "--min-seconds", "0", "--sensor", "hdl-64e"]
 
 
 @pytest.fixture
