@@ -343,8 +343,7 @@ class Network:
     def point_labels(self, points: Points) -> Bytes:
         """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
-        points = ModelFrame.of_training(self.card.mount_height_m).move_back(read_only(points))
-        pixel = project(self.projector, points).pixel
+        pixel = project(self.projector, read_only(points), ModelFrame.of_training(self.card.mount_height_m)).pixel
         return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
 
 

@@ -21,6 +21,7 @@ from edgeperc.inference.session import Session
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.card import InputSpec, ModelCard
+from edgeperc.types.frame import ModelFrame
 from edgeperc.types.points import Bytes, Floats32
 
 from ..data.scan_sets import seen_by_network
@@ -97,7 +98,8 @@ class OnnxTeacher:
         return (p, boxes) if boxes is not None else (p,)
 
     def _answer(self, session: Session, scan: LabeledScan) -> tuple[Floats32, Floats32 | None]:
-        session.input[:] = seen_by_network(self.projector, scan)[1].image
+        seen_from = ModelFrame.of_training(self.card.mount_height_m)
+        session.input[:] = seen_by_network(self.projector, scan, seen_from)[1].image
         raw = session.run()
         p = np.array(raw["class_logits"] if "class_logits" in raw else raw["class_probabilities"])
         if "class_logits" in raw:
