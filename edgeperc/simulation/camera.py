@@ -68,8 +68,6 @@ def forward_camera(
     at_m : tuple of 3 float
         Place of the camera in the frame of the LiDAR: x ahead, y left, z up [m]. By default as on KITTI's car.
     """
-    for name, pixels in (("width", width), ("height", height)):
-        NUMBERS.whole(name, pixels, 1, 2**15)
     NUMBERS.number("fov_deg", fov_deg, 1.0, 179.0)
     NUMBERS.numbers("at_m", at_m, 3)
     focal = width / (2.0 * math.tan(math.radians(fov_deg) / 2.0))

@@ -369,7 +369,6 @@ def simulate_sequence(
     Yields T_world_sensor: (4, 4) float64.
     Yields scan: ``scan.box_ids`` identify objects across scans.
     """
-    NUMBERS.whole("n_scans", n_scans, 0, 10**9)
     NUMBERS.number("rate_hz", rate_hz, LEAST, 1.0 / LEAST)
     NUMBERS.number("ego_speed_mps", ego_speed_mps)
     curvature = float(scene.strips[0, 4])
