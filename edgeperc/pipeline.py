@@ -159,6 +159,10 @@ class RangeImageNetwork:
         watch.lap("refine")
         return PointLabels(labels, pixel >= 0, self.card.classes)
 
+    def objects_of(self, labels: PointLabels) -> PointLabels:
+        """The labels of the classes that have boxes."""
+        return labels.objects(self.card.box_classes)
+
 
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
@@ -235,9 +239,7 @@ class Pipeline:
             objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score, *looks)
 
         # Objects alone: classes such as road and building are background to the stages below
-        seen = labels
-        if self.ranged:
-            labels = value("refine", PointLabels.objects, labels, self.ranged[0].card.box_classes)
+        seen, labels = labels, value("refine", self.ranged[0].objects_of, labels) if self.ranged else absent
 
         # Objects, and what the parts say of one another (KUL-Seg 5.2)
         clusters = upright = support = absent
