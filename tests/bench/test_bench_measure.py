@@ -17,7 +17,7 @@ from edgeperc.errors import MissingExtraError, ModelFileError
 from edgeperc_bench import cli, context, loadgen
 from edgeperc_bench.commands.soak import memory_growth
 from edgeperc_bench.samples import compare, noise_floor, percentile, summary, supported, trend
-from edgeperc_bench.scenarios import Clock, Limits, back_to_back, throughput
+from edgeperc_bench.scenarios import Clock, Limits, Timings, back_to_back, throughput
 
 # samples
 
@@ -30,13 +30,10 @@ def test_a_percentile_is_a_sample() -> None:
     assert np.isnan(percentile([], 50.0))
 
 
-@pytest.mark.parametrize(("p", "least"), [(50.0, 20), (90.0, 100), (99.0, 1000), (99.9, 10_000)])
-def test_a_percentile_needs_ten_samples_above_it(p: float, least: int) -> None:
-    assert supported(p, least)
-    assert not supported(p, least - 1)
-
-
-def test_a_summary_leaves_out_what_is_not_supported() -> None:
+def test_a_percentile_needs_ten_samples_above_it() -> None:
+    for p, least in ((50.0, 20), (90.0, 100), (99.0, 1000), (99.9, 10_000)):
+        assert supported(p, least)
+        assert not supported(p, least - 1)
     assert summary(range(1, 101)) == {"n": 100, "p50": 50.0, "p90": 90.0, "p99": None, "p99.9": None, "max": 100.0}
     assert summary([]) == {"n": 0, "p50": None, "p90": None, "p99": None, "p99.9": None, "max": None}
 
@@ -94,28 +91,21 @@ def test_a_trend_is_least_squares() -> None:
     assert level.slope == pytest.approx(0.0)
     assert level.error == pytest.approx(1.96 * np.sqrt(4.0 / 2.0 / 5.0))
     assert np.isnan(trend([1.0, 2.0], [1.0, 2.0]).slope)
-
-
-def test_a_trends_error_grows_where_neighbors_are_alike() -> None:
-    rng = np.random.default_rng(0)
-    x, steps = np.arange(400.0), rng.normal(0.0, 1.0, 400)
+    # The error grows where neighbors are alike.
+    x, steps = np.arange(400.0), np.random.default_rng(0).normal(0.0, 1.0, 400)
     assert trend(x, np.repeat(steps[:20], 20)).error > 2.0 * trend(x, steps).error
 
 
-@pytest.mark.parametrize(("slope", "verdict"), [(0.0, "level"), (1e-3, "grows"), (1e-6, "level")])
-def test_a_soak_tells_growth_from_noise(slope: float, verdict: str) -> None:
+def test_a_soak_tells_growth_from_noise() -> None:
     done = np.linspace(0, 18_000, 500)
-    mb = 300.0 + slope * done + np.random.default_rng(2).normal(0.0, 0.3, 500)
-    growth = memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
-    assert growth["verdict"] == verdict
-    assert growth["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
-
-
-def test_a_soak_may_be_undecided() -> None:
-    done = np.linspace(0, 18_000, 8)
-    mb = [300.0, 310.0, 295.0, 305.0, 300.0, 312.0, 296.0, 303.0]
-    assert memory_growth(np.stack([done, mb], axis=1).tolist(), 0)["verdict"] == "undecided"
-    assert memory_growth([[10, 300.0]], 0)["verdict"] == "undecided"
+    for slope, verdict in ((0.0, "level"), (1e-3, "grows"), (1e-6, "level")):
+        mb = 300.0 + slope * done + np.random.default_rng(2).normal(0.0, 0.3, 500)
+        growth = memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
+        assert growth["verdict"] == verdict
+        assert growth["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
+    few = [*zip(np.linspace(0, 18_000, 8), [300.0, 310.0, 295.0, 305.0, 300.0, 312.0, 296.0, 303.0], strict=True)]
+    for unclear in (few, [[10, 300.0]]):
+        assert memory_growth(unclear, 0)["verdict"] == "undecided"
 
 
 # scenarios
@@ -145,23 +135,29 @@ class FakePerceiver:
         return SimpleNamespace(stage_ms={"infer": 1.0})
 
 
+def timed(
+    takes_s: Sequence[float], scans: Sequence[Any], limits: Limits, late_s: float = 0.0, **options: Any
+) -> tuple[Timings, list[Any]]:
+    """The timings of scans that take so long, in turn; and the scans that were perceived."""
+    clock = FakeClock(late_s)
+    perceive = FakePerceiver(clock, takes_s)
+    return back_to_back(perceive, scans, limits, clock=clock, **options), perceive.seen
+
+
 def test_back_to_back_wants_both_scans_and_seconds() -> None:
-    clock = FakeClock()
-    perceive = FakePerceiver(clock, [0.5])
-    samples = back_to_back(perceive, ["a", "b"], Limits(3, 4.0, 2), clock=clock)
+    samples, seen = timed([0.5], ["a", "b"], Limits(3, 4.0, 2))
     assert len(samples.ms) == 8
     assert len(samples.warm_up_ms) == 2
-    assert perceive.seen == ["a", "b"] * 5
+    assert seen == ["a", "b"] * 5
     assert samples.ms == samples.age_ms == pytest.approx([500.0] * 8)
     assert samples.start_s == pytest.approx([0.5 * k for k in range(8)])
     assert samples.first_s == pytest.approx(101.0)
     assert samples.stage_ms == {"infer": [1.0] * 8}
-    assert len(back_to_back(perceive, ["a"], Limits(9, 0.0, 0), clock=clock).ms) == 9
+    assert len(timed([0.5], ["a"], Limits(9, 0.0, 0))[0].ms) == 9
 
 
 def test_the_pace_is_kept_without_drift() -> None:
-    clock = FakeClock(late_s=0.003)
-    samples = back_to_back(FakePerceiver(clock, [0.02]), ["a"], Limits(1000, 0.0, 0), rate_hz=10.0, clock=clock)
+    samples, _ = timed([0.02], ["a"], Limits(1000, 0.0, 0), late_s=0.003, rate_hz=10.0)
     # Only the very first scan is there without sleeping; every later one starts 3 ms late, the thousandth too.
     assert samples.start_s[-1] == pytest.approx(99.903)
     assert samples.age_ms[1:] == pytest.approx([23.0] * 999)
@@ -169,30 +165,20 @@ def test_the_pace_is_kept_without_drift() -> None:
 
 
 def test_a_late_answer_is_counted_and_the_newest_scan_is_next() -> None:
-    clock = FakeClock()
-    perceive = FakePerceiver(clock, [0.05, 0.35, 0.05, 0.05])
-    samples = back_to_back(perceive, list(range(10)), Limits(4, 0.0, 0), rate_hz=10.0, clock=clock)
+    samples, seen = timed([0.05, 0.35, 0.05, 0.05], list(range(10)), Limits(4, 0.0, 0), rate_hz=10.0)
     # The second scan arrives at 0.1 s and is answered at 0.45 s: scans 2 and 3 are overtaken by scan 4, of 0.4 s.
-    assert perceive.seen == [0, 1, 4, 5]
-    assert samples.skipped == 2
-    assert samples.missed == 1
+    assert seen == [0, 1, 4, 5]
+    assert (samples.missed, samples.skipped) == (1, 2)
     assert samples.age_ms == pytest.approx([50.0, 350.0, 100.0, 50.0])
     assert samples.start_s == pytest.approx([0.0, 0.1, 0.45, 0.5])
 
 
-def test_a_long_run_keeps_few_samples_and_counts_all() -> None:
-    clock = FakeClock()
-    samples = back_to_back(FakePerceiver(clock, [0.1]), ["a"], Limits(100, 0.0, 0, stride=40), clock=clock)
+def test_a_long_run_keeps_few_samples_and_ends_when_told() -> None:
+    samples, _ = timed([0.1], ["a"], Limits(100, 0.0, 0, stride=40))
     assert samples.n == 100
     assert samples.start_s == pytest.approx([0.0, 4.0, 8.0])
     assert len(samples.ms) == len(samples.age_ms) == len(samples.stage_ms["infer"]) == 3
-
-
-def test_a_scenario_ends_when_told() -> None:
-    clock = FakeClock()
-    samples = back_to_back(
-        FakePerceiver(clock, [0.1]), ["a"], Limits(100, 0.0, 5), clock=clock, keep_going=lambda s: len(s.ms) < 7
-    )
+    samples, _ = timed([0.1], ["a"], Limits(100, 0.0, 5), keep_going=lambda s: len(s.ms) < 7)
     assert (len(samples.warm_up_ms), len(samples.ms)) == (5, 7)
 
 
@@ -244,9 +230,7 @@ def test_every_disturbance_is_reported() -> None:
     for part in ("2.0 of 4 cores", "5% of the CPU time", "heat 2 times", "quota paused it 3 times", "95 C", "2000 MHz"):
         assert part in found
     assert "battery" in found
-
-
-def test_what_lasts_is_reported_too() -> None:
+    # What lasts, too
     calm = {"governor": "performance", "turbo": False, "cpu_quota": None, "hypervisor": False}
     assert context.lasting_disturbances(calm, []) == []
     wild = {"governor": "powersave", "turbo": True, "cpu_quota": 0.5, "hypervisor": True}
