@@ -66,25 +66,9 @@ def _is_same(box: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 def compare(
     name: str, here: Answers, there: Answers, kind: str, auto: Mapping[str, str]
 ) -> tuple[list[list[str]], list[str]]:
-    """Compare the answers of another processor with those of this one.
-
-    Parameters
-    ----------
-    name : str
-        Of the other processor.
-    here, there : tuple
-        From `read`.
-    kind : {"scans", "networks"}
-        What ``there`` holds.
-    auto : mapping
-        Network to the precision that ``"auto"`` should take on the other processor.
-
-    Returns
-    -------
-    rows : list of list of str
-        Of the table with the columns of `COLUMNS`.
-    faults : list of str
-        What differs more than it may; empty if nothing does.
+    """Compare the answers of another processor, to "scans" or of "networks", with those of this one: rows of a table
+    with the columns of `COLUMNS`, and what differs more than it may. ``auto``: network -> the precision that ``"auto"``
+    should take there.
     """
     rows, faults = [], []
     for precision in ("fp32", "int8"):

@@ -39,13 +39,7 @@ def cpuinfo(cpu: str) -> str:
 
 
 class Environment:
-    """An aarch64 system in a folder.
-
-    Parameters
-    ----------
-    folder : Path
-        It is kept between runs; other versions of the wheels replace those in it.
-    """
+    """An aarch64 system in a folder, which is kept between runs; other versions of the wheels replace those in it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.absolute()
