@@ -45,26 +45,20 @@ def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap:
     assert line.startswith("int8: labels agree on 75.000%")
 
 
-def test_a_network_without_boxes_has_no_ap() -> None:
-    record = module.record_of(measured([0], 0.5, None), measured([0], 0.6, None), "a command")
+def test_what_is_not_measured_has_no_figure() -> None:
+    """`auto` took a model of which no accuracy was measured: the larger one of 0 and NaN is 0."""
+    record = module.record_of(measured([0], 0.5, None), measured([0], 0.6, None), "a command")  # without boxes
     assert (record["loss"], record["ap"], record["fp32_ap"]) == (10.0, None, None)
     assert "AP" not in summary({"int8": record})[0]
-
-
-def test_a_loss_that_is_not_measured_is_none() -> None:
-    """`auto` took a model of which no accuracy was measured: the larger one of 0 and NaN is 0."""
     for own in (measured([0], np.nan, None), measured([0], 0.5, np.nan)):
         with pytest.raises(PointsError, match="show no class of the network"):
             module.record_of(own, own, "a command")
 
 
-@pytest.mark.parametrize("models", [["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]])
-def test_files_must_be_of_one_network_and_one_in_fp32(models: list[str]) -> None:
-    with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
-        agree(models, kitti=None)
-
-
-def test_labeled_scans_are_required(tmp_path: Path) -> None:
+def test_files_must_be_of_one_network_and_one_in_fp32(tmp_path: Path) -> None:
+    for models in (["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]):
+        with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
+            agree(models, kitti=None)
     path = tmp_path / "pointseg.onnx"
     shutil.copy(model_path("pointseg"), path)
     with pytest.raises(PointsError, match="name a KITTI object set"):
