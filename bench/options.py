@@ -28,17 +28,13 @@ def add_command(
     help: str,
     description: str,
 ) -> Options:
-    """Declare a command with the groups of options that it shares with others; returns what adds its own."""
+    """Declare a command with the groups of options that it shares with others ("model", "scans", "engine", "output" and
+    "page"); returns what adds its own.
+    """
     parser = subparsers.add_parser(name, help=help, description=description, allow_abbrev=False)
     parser.set_defaults(run=command)
     add = options(parser)
-    _add_shared(add, shared)
-    return add
-
-
-def _add_shared(add: Options, groups: Sequence[str]) -> None:
-    """The options of some groups: "model", "scans", "engine", "output" and "page"."""
-    if "model" in groups:
+    if "model" in shared:
         add(
             "--model NAME",
             "a shipped model (ssadnet), one variant of it (ssadnet:int8) or the path of an .onnx file; may be "
@@ -47,26 +43,27 @@ def _add_shared(add: Options, groups: Sequence[str]) -> None:
         )
         # Scans of one's own may be of another sensor: as that of KITTI, they would be filled or thinned otherwise.
         sensor, default = "a name that 'edgeperc sensors' lists, or a .json file (default: %(default)s)", DEFAULT_SENSOR
-        if "scans" in groups:
+        if "scans" in shared:
             sensor = f"found in the points of --input (auto, the default; {DEFAULT_SENSOR} is simulated), or a name "
             sensor, default = f"{sensor}that 'edgeperc sensors' lists, or a .json file", AUTO_SENSOR
         add("--sensor NAME", f"the sensor that recorded the scans: {sensor}", default=default)
-    if "scans" in groups:
+    if "scans" in shared:
         files = "measure with these scan files, or all scan files of these folders (default: simulated scans)"
         add("--input SCANS...", files, type=Path)
         simulated = "the number of simulated scans, used in turn (default: %(default)s)"
         add("--scans N", simulated, type=positive, default=8)
-    if "engine" in groups:
+    if "engine" in shared:
         runs = f"the execution provider that runs the models: auto, {', '.join(PROVIDERS)} (default: %(default)s)"
         add("--provider P", runs, type=provider, default="auto")
         computed = f"the precision in which the models run: auto, {', '.join(PRECISIONS)} (default: %(default)s)"
         add("--precision P", computed, choices=("auto", *PRECISIONS), default="auto")
         add("--threads N", "the number of threads inside a model (default: the provider's choice)", type=positive)
-    if "output" in groups:
+    if "output" in shared:
         add("--json FILE", "write the report, with every sample, to this file")
         add("--markdown FILE", "write the tables as Markdown to this file")
-    if "page" in groups:
+    if "page" in shared:
         add("--html FILE", "write a page with plots to this file (needs the extra 'view')")
+    return add
 
 
 def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:
