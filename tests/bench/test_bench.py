@@ -48,12 +48,12 @@ def prediction(labels: Sequence[int], cells: int, boxes: Sequence[Box]) -> worke
     return worker.Prediction(points, top_view, tuple(boxes))
 
 
+def car(x: float) -> Box:
+    return scenes.box(x, score=0.9, size=(4.0, 2.0, 1.5), z=-1.0)
+
+
 def test_agreement_counts_labels_and_boxes() -> None:
-    car, far = (
-        Box("car", 0.9, (20.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
-        Box("car", 0.9, (30.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
-    )
-    right, guess = [prediction([0, 1, 1, 0], 1, [car])], [prediction([0, 1, 0, 1], 1, [car, far])]
+    right, guess = [prediction([0, 1, 1, 0], 1, [car(20)])], [prediction([0, 1, 0, 1], 1, [car(20), car(30)])]
     same = accuracy.agreement(right, guess)
     # The last point is out of view; background: 1 of 2, car: 1 of 2.
     assert same["points"] == pytest.approx({"equal": 2.0 / 3.0, "mean_iou": 0.5}, abs=1e-6)
@@ -62,14 +62,12 @@ def test_agreement_counts_labels_and_boxes() -> None:
     equal = {"agreement": accuracy.agreement(right, right), "truth": None, "reference_truth": None}
     assert accuracy.agrees(equal)
     assert not accuracy.agrees(equal | {"agreement": same})
-    assert not accuracy.agrees(
-        equal | {"truth": {"points_mean_iou": 0.58}, "reference_truth": {"points_mean_iou": 0.6}}
-    )
+    worse = {"truth": {"points_mean_iou": 0.58}, "reference_truth": {"points_mean_iou": 0.6}}
+    assert not accuracy.agrees(equal | worse)
 
 
 def test_boxes_are_compared_where_they_are_all_that_a_model_answers() -> None:
-    cars = [Box("car", 0.9, (x, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0) for x in (20.0, 30.0)]
-    right, guess = ([worker.Prediction(None, None, tuple(boxes))] for boxes in (cars, cars[:1]))
+    right, guess = ([worker.Prediction(None, None, tuple(map(car, places)))] for places in ((20, 30), (20,)))
     for found, agrees in ((right, True), (guess, False)):
         compared = {"agreement": accuracy.agreement(right, found), "truth": None, "reference_truth": None}
         assert compared["agreement"]["boxes"]["n_both"] == len(found[0].boxes)
@@ -239,41 +237,36 @@ def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
 
 @pytest.fixture
 def reports(tmp_path: Path) -> Any:
-    def written(name: str, *medians: float, **changes: Any) -> str:
-        write_report(plain(document(*medians, **changes)), tmp_path / name)
+    def written(name: str, *medians: float, of: Any = None, **changes: Any) -> str:
+        write_report(plain(document(*medians, **changes) if of is None else of), tmp_path / name)
         return str(tmp_path / name)
 
     return written
 
 
-def test_compare_answers_by_its_exit_code(reports: Any, tmp_path: Path, shell: Shell) -> None:
+def test_compare_answers_by_its_exit_code(reports: Any, shell: Shell) -> None:
     a = reports("a.json", 20.0, 20.1)
     assert "no difference" in shell.out("compare", a, reports("same.json", 20.05, 19.95))
     assert "faster" in shell.out("compare", a, reports("fast.json", 17.0, 17.1))
     assert "slower" in shell.out("compare", a, reports("slow.json", 23.0, 23.1), code=1)
     assert "--repeats" in shell.out("compare", a, reports("once.json", 23.0), code=2)
     assert "different scans" in shell.err("compare", a, reports("other.json", 20.0, 20.1, sha256="t"))
-    other = plain(document(20.0, 20.1))
+    other = document(20.0, 20.1) | {"complete": False}
     other["input"]["sensor"] = "os1-64"
-    other["complete"] = False
-    write_report(other, tmp_path / "b.json")
-    said = shell.out("compare", a, tmp_path / "b.json")
+    said = shell.out("compare", a, reports("b.json", of=other))
     assert "different sensors: A as of hdl-64e, B as of os1-64" in said
     assert "B was interrupted" in said
     assert "nowhere.json" in shell.err("compare", a, "nowhere.json")
 
 
-def test_compare_wants_the_same_setting_or_one_of_each(reports: Any, tmp_path: Path) -> None:
-    one = plain(document(20.0, 20.1))
+def test_compare_wants_the_same_setting_or_one_of_each(reports: Any, shell: Shell) -> None:
+    one = document(20.0, 20.1)
+    # With several settings in a report only equal ones are compared.
+    several = reports("several.json", of=one | {"settings": [*one["settings"], *one["settings"]]})
     for key, value, code in (("precision", "int8", 0), ("provider", "openvino", 0), ("models", ["ssadnet"], 2)):
-        changed = plain(document(20.0, 20.1))
-        changed["settings"][0][key] = value
-        write_report(changed, tmp_path / "b.json")
-        assert cli.main(["compare", reports("a.json", 20.0, 20.1), str(tmp_path / "b.json")]) == code
-        # With several settings in a report only equal ones are compared.
-        both = one | {"settings": [*one["settings"], *one["settings"]]}
-        write_report(both, tmp_path / "several.json")
-        assert cli.main(["compare", str(tmp_path / "several.json"), str(tmp_path / "b.json")]) == 2
+        changed = reports("b.json", of=one | {"settings": [one["settings"][0] | {key: value}]})
+        shell.both("compare", reports("a.json", of=one), changed, code=code)
+        shell.both("compare", several, changed, code=2)
 
 
 WRONG = (
@@ -391,22 +384,19 @@ def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
     assert recommend(measured) == []
 
 
-def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
+def test_scans_are_sized_and_crowded_in_the_sensors_own_unit(tmp_path: Path) -> None:
     assert inputs.sized(1000, "hdl-64e").shape == (1000, 4)
     assert inputs.sized(150_000, "hdl-64e").shape == (150_000, 4)
     assert len(inputs.crowd(4, "hdl-64e")) > 50_000
+    scans, profile = inputs.simulated_input(tmp_path, 1, "os1-64"), inputs.get_sensor("os1-64")
+    remission = np.load(scans.files[0])[:, 3] + np.float32(profile.remission_offset)
+    back = remission * np.float32(profile.remission_scale)
+    np.testing.assert_allclose(back, scans.truth[0].points[:, 3], atol=1e-4)
+    (nothing := tmp_path / "nothing").mkdir()
     with pytest.raises(PointsError, match="holds no scan"):
-        inputs.read_input(tmp_path, [tmp_path], "hdl-64e")
+        inputs.read_input(tmp_path, [nothing], "hdl-64e")
     with pytest.raises(OSError, match=r"scan\.npy cannot be written .*set TMPDIR"):
         inputs.store(tmp_path / "nowhere", "scan", np.ones((1, 4), np.float32))
-
-
-def test_simulated_scans_come_in_the_sensors_own_unit(tmp_path: Path) -> None:
-    scans = inputs.simulated_input(tmp_path, 1, "os1-64")
-    raw = np.load(scans.files[0])
-    profile = inputs.get_sensor("os1-64")
-    back = (raw[:, 3] + np.float32(profile.remission_offset)) * np.float32(profile.remission_scale)
-    np.testing.assert_allclose(back, scans.truth[0].points[:, 3], atol=1e-4)
 
 
 def test_the_sensor_of_ones_own_scans_is_found_in_their_points(tmp_path: Path) -> None:
@@ -620,9 +610,6 @@ def test_an_interrupted_run_writes_what_it_has(
 def test_errors_of_a_process_arrive_as_they_were() -> None:
     with pytest.raises(ModelFileError, match="no model is called 'nobody'"):
         worker.measure([worker.Job(("nobody",), "cpu")])
-
-
-def test_a_dead_process_is_an_error() -> None:
     dead, silent = SimpleNamespace(exitcode=-9, join=lambda: None), SimpleNamespace(recv=Mock(side_effect=EOFError))
     with pytest.raises(worker.WorkerError, match="exit code -9"):
         worker.receive(silent, dead)
