@@ -33,46 +33,31 @@ def stub(repository: Path) -> ModuleType:
     """What the Python backend offers to a model; requests to networks are answered by onnxruntime."""
     onnxruntime = pytest.importorskip("onnxruntime")
 
-    class Tensor:
-        def __init__(self, name: str, array: np.ndarray) -> None:
-            self._name, self._array = name, array
+    def tensor(name: str, array: np.ndarray) -> SimpleNamespace:
+        return SimpleNamespace(name=lambda: name, as_numpy=lambda: array)
 
-        def name(self) -> str:
-            return self._name
-
-        def as_numpy(self) -> np.ndarray:
-            return self._array
-
-    class InferenceResponse:
-        def __init__(self, output_tensors: list[Tensor], error: Any = None) -> None:
-            self.tensors, self._error = output_tensors, error
-
-        def has_error(self) -> bool:
-            return self._error is not None
-
-        def error(self) -> Any:
-            return self._error
+    def response(output_tensors: list[Any], error: Any = None) -> SimpleNamespace:
+        return SimpleNamespace(tensors=output_tensors, has_error=lambda: error is not None, error=lambda: error)
 
     class InferenceRequest:
         def __init__(
-            self, model_name: str, requested_output_names: list[str], inputs: list[Tensor], preferred_memory: object
+            self, model_name: str, requested_output_names: list[str], inputs: list[Any], preferred_memory: object
         ) -> None:
             self.model, self.wanted, self.tensors = model_name, requested_output_names, inputs
 
-        def exec(self) -> InferenceResponse:
+        def exec(self) -> SimpleNamespace:
             session = onnxruntime.InferenceSession(str(repository / self.model / "1" / "model.onnx"))
-            given = {tensor.name(): tensor.as_numpy() for tensor in self.tensors}
-            found = session.run(self.wanted, given)
-            return InferenceResponse([Tensor(*pair) for pair in zip(self.wanted, found, strict=True)])
+            found = session.run(self.wanted, {each.name(): each.as_numpy() for each in self.tensors})
+            return response([tensor(*pair) for pair in zip(self.wanted, found, strict=True)])
 
-    def tensor_of(holder: Any, name: str) -> Tensor | None:
-        return next((tensor for tensor in holder.tensors if tensor.name() == name), None)
+    def tensor_of(holder: Any, name: str) -> Any:
+        return next((each for each in holder.tensors if each.name() == name), None)
 
     module = ModuleType("triton_python_backend_utils")
     vars(module).update(
-        Tensor=Tensor,
+        Tensor=tensor,
         InferenceRequest=InferenceRequest,
-        InferenceResponse=InferenceResponse,
+        InferenceResponse=response,
         TritonError=lambda text: SimpleNamespace(message=lambda: text),
         PreferredMemory=lambda kind, device: None,
         TRITONSERVER_MEMORY_CPU=0,
