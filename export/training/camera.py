@@ -36,7 +36,7 @@ class Camera(Carded[CameraGeometry]):
         and column if they are coarser); and cross-entropy of early logits at a quarter of the resolution.
         """
         recipe, (labels,) = self.recipe, targets
-        weights = _weights(labels.device) if recipe.class_weights else None
+        weights = on_device(class_weights(), labels.device) if recipe.class_weights else None
         logits, *early = [outputs] if isinstance(outputs, Tensor) else outputs
         coarse = logits.shape[2:] != labels.shape[1:]
         logits = upsampled(logits, labels.shape[1:])
@@ -65,9 +65,9 @@ def class_weights() -> tuple[float, ...]:
 
 
 @cache
-def _weights(device: torch.device) -> Tensor:
-    """`class_weights` on a device; kept, because copying them there waits for it."""
-    return torch.tensor(class_weights(), device=device)
+def on_device(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """Constants on a device; kept, because copying them there waits for it."""
+    return torch.tensor(values, device=device)
 
 
 def upsampled(logits: Tensor, size: torch.Size | tuple[int, ...]) -> Tensor:

@@ -6,7 +6,7 @@ As 8-bit integers they take 250 MB, so a training step reads no file and waits f
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -23,7 +23,7 @@ from edgeperc.simulation.street import CAMERA_CLASSES
 from edgeperc.types.card import InputSpec
 from edgeperc.types.points import Floats, Ints64
 
-from .camera import Camera, upsampled
+from .camera import Camera, on_device, upsampled
 from .losses import cross_entropy
 
 # Bounds of the random scale, of the change of the aspect, and of the factors of brightness, contrast and saturation.
@@ -82,15 +82,8 @@ def read_camvid(root: Path, split: str) -> ImageSet:
 
 def normalized(images: Tensor, spec: InputSpec) -> Tensor:
     """Images (B, 3, H, W) in 0..255 as a network's input, float32."""
-    mean, std = _scaling(spec, images.device)
+    mean, std = (on_device(values, images.device)[:, None, None] for values in (spec.mean, spec.std))
     return (images.float() - mean) / std
-
-
-@cache
-def _scaling(spec: InputSpec, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the channels; kept, because copying them to a device waits for it."""
-    mean, std = (torch.tensor(values, device=device)[:, None, None] for values in (spec.mean, spec.std))
-    return mean, std
 
 
 def augmented_images(images: Tensor, labels: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
