@@ -142,6 +142,7 @@ FLOORS = {
         training.camera training.object_samples training.start training.task
         training.images training.object_sets training.teacher
         training.object_batches training.samples
+        training.sources
         training.train
         training.ablation training.camvid
         release.__init__ release.int8_graph release.models_page release.object_graph release.object_parity

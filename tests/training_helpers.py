@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from torch import Tensor, nn
 
 from edgeperc_export import make as make_module
 from edgeperc_export.recipe import Recipe
@@ -42,7 +44,7 @@ def of_train(settings: dict[str, Any]) -> tuple[Data, Run, dict[str, Any]]:
 
 
 def train(recipe: Recipe, out: Path, **settings: Any) -> Path:
-    data, run, others = of_train(settings)
+    data, run, others = of_train({"n_threads": 1, **settings})
     assert not others
     return training.train(recipe, out, data, run)
 
@@ -55,3 +57,17 @@ def make(name: str, out: Path, **settings: Any) -> Path:
 def ablate(network: str, out: Path, **settings: Any) -> list[dict[str, Any]]:
     data, run, others = of_train(settings)
     return ablation.ablate(network, out, data, run, **others)
+
+
+def losses_of_steps(
+    network: nn.Module, loss_of: Callable[[nn.Module], Tensor], n_steps: int, rate: float
+) -> list[float]:
+    """Train a network on one batch; returns the loss before each step."""
+    optimizer, losses = torch.optim.AdamW(network.parameters(), lr=rate), []
+    for _ in range(n_steps):
+        loss = loss_of(network)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return losses

@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -42,16 +43,29 @@ NEAR_M = 0.5
 interpolator_of = lru_cache(maxsize=64)(Interpolator)
 
 
+class Labeled(NamedTuple):
+    """Scans to train on or to watch."""
+
+    scans: list[LabeledScan]
+    weights: list[float]  # how often each is drawn: all scans of a drive together as the square root of their number
+    hashes: dict[str, str]  # name, or ``SET/NAME`` -> `edgeperc.datasets.kitti.scan_hash`
+
+
+def joined(parts: Sequence[Labeled]) -> Labeled:
+    """The scans of all parts."""
+    return Labeled(
+        [scan for part in parts for scan in part.scans],
+        [weight for part in parts for weight in part.weights],
+        reduce(joined_hashes, (part.hashes for part in parts), {}),
+    )
+
+
 def read_scan_set(
     folder: ScanFolder, split: str, fold: int | None = None, *, classes: Sequence[str] = POINT_CLASSES
-) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Read the labeled scans of a split; objects of other classes than those of points are unknown (`IGNORE`).
-
-    As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
-    drive, and the remission is matched to that of the training sensor.
-
-    Returns weights: How often to draw each scan: all scans of a drive together as the square root of their number.
-    Returns hashes: ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+) -> Labeled:
+    """Read the labeled scans of a split; objects of other classes than those of points are unknown (`IGNORE`). As in a
+    `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each drive, and
+    the remission is matched to that of the training sensor.
     """
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
@@ -79,7 +93,7 @@ def read_scan_set(
         points, _ = condition(frame.points, sensor)
         scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
     weights = [n_scans[frame.drive] ** -0.5 for frame in frames]
-    return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames}
+    return Labeled(scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames})
 
 
 def check_trains(folder: ScanFolder, *splits: str, fold: int | None = None) -> None:
@@ -137,12 +151,8 @@ def seen_by_network(
     projector: TopViewProjector | RangeImageProjector, scan: LabeledScan, seen_from: ModelFrame = OF_MODELS
 ) -> tuple[LabeledScan, Projection]:
     """A training scan projected as the runtime projects a scan of its sensor, for a network with points
-    ``seen_from`` there.
-
-    Returns scan: If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as
-        the nearest of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m
-        away and one of them is no background. Else the given one.
-    Returns projected: Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
+    ``seen_from`` there; with interpolated points, labeled by `_nearest_labels`, if the range image of a coarser sensor
+    was filled. The projection's ``index`` refers to the points of the returned scan, ``pixel`` to the given ones.
     """
     points = np.ascontiguousarray(scan.points, np.float32)
     projected = project(projector, points, seen_from)

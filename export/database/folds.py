@@ -22,10 +22,10 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.types.card import ModelCard
 
 from ..data.roads import DatabaseError, mask_of, with_road
+from ..data.scan_sets import Labeled
 from ..data.scans import LabeledScan
 from ..recipe import Recipe
 from ..release.to_onnx import export, write_card
-from ..training.samples import RealScans
 from ..training.train import Data, train
 from .files import N_FOLDS
 
@@ -67,8 +67,8 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
         made[key] = model
         scans, watched = _labeled(objects, trained_on), _labeled(objects, held_out)
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
-        given = RealScans([*scans.values()], hashes, [*watched.values()])
-        checkpoint = train(recipe, work / key, Data(given=given))
+        given = Labeled([*scans.values()], [1.0] * len(scans), hashes)
+        checkpoint = train(recipe, work / key, Data(given=(given, [*watched.values()])))
         fitness = FitnessProfile.from_scans(scan.points for scan in scans.values())
         proof = [scan.points for scan in scans.values()][:4]
         export(checkpoint, model, scans=proof, fitness=fitness, name=name)

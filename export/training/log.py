@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,21 +16,20 @@ from edgeperc.system.extras import require
 class TrainingLog:
     """Writes ``log.jsonl``, ``log.csv`` (names as of TensorBoard, ``validation/car``) and, if asked, event files into a
     run's folder, where a run that is resumed after ``step`` goes on: lines of later steps, which it makes again, are
-    removed. Nothing without a folder. Raises MissingExtraError.
+    removed. Raises MissingExtraError.
     """
 
-    def __init__(self, folder: Path | None, step: int = 0, *, tensorboard: bool = False) -> None:
+    def __init__(self, folder: Path, step: int = 0, *, tensorboard: bool = False) -> None:
         self._events: Any = None
-        if tensorboard and folder is not None:
+        if tensorboard:
             require("tensorboard", "tensorboard", "--tensorboard")
             writer = require("torch.utils.tensorboard", "tensorboard", "--tensorboard").SummaryWriter
             self._events = writer(str(folder), purge_step=step + 1 if step else None)
-        path = Path(os.devnull) if folder is None else folder / "log.jsonl"
-        self._table = None if folder is None else folder / "log.csv"
-        if folder is not None and path.exists():
+        path, self._table = folder / "log.jsonl", folder / "log.csv"
+        if path.exists():
             kept = [line for line in whole_lines(path) if not step or line["step"] <= step]
             write_atomic(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
-            (folder / "log.csv").unlink(missing_ok=True)
+            self._table.unlink(missing_ok=True)
             for line in kept:
                 self._add_row(flat(line))
         self._lines = path.open("a", encoding="utf-8")
@@ -49,13 +47,12 @@ class TrainingLog:
             self._events.flush()
 
     def _add_row(self, row: Mapping[str, Any]) -> None:
-        if self._table is not None:
-            is_new = not self._table.exists()
-            with self._table.open("a", encoding="utf-8", newline="") as file:
-                table = csv.writer(file)
-                if is_new:
-                    table.writerow(row)
-                table.writerow(row.values())
+        is_new = not self._table.exists()
+        with self._table.open("a", encoding="utf-8", newline="") as file:
+            table = csv.writer(file)
+            if is_new:
+                table.writerow(row)
+            table.writerow(row.values())
 
     def __enter__(self) -> TrainingLog:
         return self

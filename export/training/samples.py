@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from ..data.augment import NEGATIVES, Augmentation, ObjectBank, augmented, swapp
 from ..data.beams import drawn_sensor
 from ..data.processes import CONTEXT
 from ..data.roads import drawn_roads, sure_surface, with_road
-from ..data.scan_sets import seen_by_network
+from ..data.scan_sets import Labeled, seen_by_network
 from ..data.scans import LabeledScan
 from ..recipe import Recipe
 from .ranks import Ranks
@@ -231,17 +230,9 @@ class Recent:
         return [part[chosen] for part in self._parts]
 
 
-class RealScans(NamedTuple):
-    """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads."""
-
-    scans: list[LabeledScan]
-    hashes: dict[str, str]  # name -> `scan_hash`, for the card
-    watched: list[LabeledScan]  # to validate on
-
-
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False, classes: Sequence[str] = ()
-) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
+) -> Labeled:
     """Labeled scans of KITTI (``drawn``: with the hand-drawn roads), their weights, and their hashes by name."""
     scans: list[LabeledScan] = []
     weights: list[float] = []
@@ -261,4 +252,4 @@ def real_scans(
         # drive has up to 154). A scan with a drawn road weighs as much as a drive with one frame, because its ground is
         # known everywhere.
         weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
-    return scans, weights, hashes
+    return Labeled(scans, weights, hashes)

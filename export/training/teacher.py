@@ -6,9 +6,10 @@ teacher labels the points whose class it is sure of (pseudo-labels; Lee, 2013); 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ from edgeperc.types.points import Bytes, Floats32
 from ..data.scan_sets import seen_by_network
 from ..data.scans import SURFACE, LabeledScan, mirrored, turned
 from .bfloat16 import in_bfloat16
-from .task import Task
+from .checkpoint import build_network, read_checkpoint
+from .task import Task, task_of
 
 SURE = 0.9
 """Smallest probability of a pseudo-label."""
@@ -66,6 +68,29 @@ def pseudo_labeled(
             labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
         labeled.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
     return labeled
+
+
+class _OfChannels(nn.Module):
+    """A network that sees some channels of another network's input."""
+
+    def __init__(self, network: nn.Module, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.network, self.channels = network, list(channels)
+
+    def forward(self, x: Tensor) -> Any:
+        return self.network(x[:, self.channels])
+
+
+def teacher_network(checkpoint: Path, task: Task) -> nn.Module:
+    """The network of a checkpoint with the same view as the task, and with the same channels or fewer."""
+    state = read_checkpoint(checkpoint)
+    recipe = state["recipe"]
+    seen, own = (
+        list(zip(spec.channels, spec.mean, spec.std, strict=True)) for spec in (task.input, task_of(recipe).input)
+    )
+    if task_of(recipe).view != task.view or not set(own) <= set(seen):
+        raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
+    return _OfChannels(build_network(state, checkpoint), [seen.index(channel) for channel in own]).eval()
 
 
 class OnnxTeacher:

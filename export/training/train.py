@@ -11,13 +11,11 @@ import hashlib
 import json
 import math
 import time
-import warnings
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,61 +23,27 @@ from filelock import FileLock, Timeout  # torch needs it, too
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from edgeperc.datasets.kitti import KittiObjects
-from edgeperc.datasets.layout import BACKGROUND, numbers_of_scene
-from edgeperc.datasets.scan_folder import ScanFolder
-from edgeperc.preprocess.fitness import FitnessProfile
-from edgeperc.simulation.samples import IGNORE
-from edgeperc.simulation.scene import POINT_CLASSES, SCENE_CLASSES
+from edgeperc.datasets.layout import BACKGROUND
 from edgeperc.system.atomic import open_atomic
-from edgeperc.types.views import TopViewGeometry
 
-from ..data.scan_sets import check_trains, joined_hashes, read_scan_set
-from ..data.scans import LabeledScan
-from ..data.simulate import simulated_files
+from ..data.scan_sets import joined_hashes
 from ..networks import build
 from ..recipe import Recipe
 from .bfloat16 import in_bfloat16
-from .camera import Camera
-from .checkpoint import build_network, read_checkpoint, write_mean
-from .images import ImageSamples, ImageWatch, camvid_samples
+from .checkpoint import read_checkpoint, write_mean
 from .log import TrainingLog
-from .object_batches import ObjectBatches, ObjectWatch
-from .object_samples import load_samples
-from .object_sets import PASTED, VALIDATION, write_samples
-from .object_task import Objects
+from .object_batches import ObjectBatches
 from .ranks import Ranks
-from .samples import RealScans, Samples, Watch, loaded, real_scans
+from .samples import Samples, loaded
+from .sources import Data as Data
+from .sources import read_source
 from .start import start
-from .task import Task, task_of
-from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
+from .task import Task
+from .teacher import teach
 
 WARM_UP_STEPS = 100
-LABELS, SENSOR = "truth of its scans or images, or simulated scan", "sensor or labeled sector of the scans"
-OBJECT_SAMPLES = "object-samples"
-"""Folder beside those of the runs, with the samples of the object network."""
-
-# Of a drive with more frames than this, every sixth is enough to validate on, because neighboring frames look alike.
-FEW_FRAMES = 6
-VALIDATION_STRIDE = 6
 # Batches that the statistics of batch norm are computed from, if a run starts from an exported model.
 STATISTICS_BATCHES = 8
-
-
-@dataclass(frozen=True, slots=True)
-class Data:
-    """What a network is trained on and watched on; frames of test drives are not used."""
-
-    # an object set; its validation drives, or all if only simulated scans are trained on, are watched
-    kitti: Path | None = None
-    simulated: Path | None = None  # folder of scans written by ``edgeperc-export simulate``
-    camvid: Path | None = None  # for a camera's networks: training images, and validation images for the curve
-    scan_sets: Sequence[ScanFolder] = ()  # of any sensor, by their own drives
-    given: RealScans | None = None  # in place of those of ``kitti``
-    fold: int | None = None  # validated on instead of trained on, and the best weights are kept (early stopping)
-
-
-FITNESS_SCANS = 64  # real scans, at least, that a card's check of inputs describes
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,26 +60,25 @@ class Run:
     save_every_s: float = 0.0  # between checkpoints, at least, as large networks take seconds to write
 
 
-def train(recipe: Recipe, out: Path, data: Data, run: Run | None = None) -> Path:
+def train(recipe: Recipe, out: Path, data: Data, run: Run = Run()) -> Path:  # it is immutable
     """Train the network of a recipe in a folder, or resume it; returns the checkpoint. ``torchrun``'s processes share
     each batch: weights equal those of one up to rounding. Several runs have folders of their own beside ``out``, which
     gets their mean. Raises ValueError, FloatingPointError, RankError.
     """
-    run = run or Run()
     recipe.check()
     if recipe.classes and recipe.classes[0] != BACKGROUND:
         raise ValueError(f"--classes begins with {recipe.classes[0]}; expected {BACKGROUND}, which is not looked for")
     ranks = Ranks()
     ranks.check(recipe.batch, recipe.accumulate, run.compiled)
+    folders = [out] if recipe.runs == 1 else [out.with_name(f"{out.name}-run-{k}") for k in range(recipe.runs)]
+    checkpoints = []
     with ranks.together():
-        if recipe.runs == 1:
-            with _alone_in(out, ranks):
-                return _Training(recipe, out, data, run, ranks).finish()
-        checkpoints = []
-        for k in range(recipe.runs):
-            of_run, folder = replace(recipe, runs=1, seed=recipe.seed + k), out.with_name(f"{out.name}-run-{k}")
+        for k, folder in enumerate(folders):
             with _alone_in(folder, ranks):
+                of_run = replace(recipe, runs=1, seed=recipe.seed + k)
                 checkpoints.append(_Training(of_run, folder, data, run, ranks).finish())
+        if recipe.runs == 1:
+            return checkpoints[0]
         if ranks.is_first:
             out.mkdir(parents=True, exist_ok=True)
             write_mean(checkpoints, recipe, out / checkpoints[0].name)
@@ -135,19 +98,6 @@ def _alone_in(folder: Path, ranks: Ranks) -> Iterator[None]:
         raise ValueError(f"another training runs in {folder}; wait for its end, or give another folder") from None
     finally:
         lock.release()
-
-
-class _Source(NamedTuple):
-    """What a network is trained on and watched on, read."""
-
-    task: Task | Camera | Objects
-    samples: Samples | ImageSamples | ObjectBatches
-    watch: Watch | ImageWatch | ObjectWatch | None
-    hashes: dict[str, str]
-    n_real: int
-    made_of: dict[str, str]  # digests of what a user may have changed: `LABELS`, `SENSOR`
-    teacher: nn.Module | None = None
-    fitness: dict[str, Any] | None = None
 
 
 @dataclass(slots=True)
@@ -174,12 +124,7 @@ class _Training:
         if run.n_threads is not None:
             torch.set_num_threads(run.n_threads)
         torch.backends.cudnn.benchmark = True  # inputs have one size
-        if recipe.task == "camera":
-            self.source = _image_source(recipe, data, ranks.device)
-        elif recipe.task == "objects":
-            self.source = _object_source(recipe, out.parent / OBJECT_SAMPLES, data, run)
-        else:
-            self.source = _scan_source(recipe, data, run, ranks.device)
+        self.source = read_source(recipe, out.parent, data, run.teacher, run.n_workers, ranks.device)
         self.made_of = {**self.source.made_of, "--teacher": _digest_of_file(run.teacher)}
         # Without weights that are kept, a resumed run does not read it.
         if recipe.kept > 0.0 or (run.start_from is not None and run.start_from.exists()):
@@ -207,28 +152,18 @@ class _Training:
         if self.checkpoint.exists():
             self._resume()
 
-    def _start(self, network: nn.Module, path: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
-        """`start`, with the first batches for the statistics of batch norm."""
-        images = [torch.as_tensor(self.source.samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
-        return start(network, self.recipe, path, images)
-
     def finish(self) -> Path:
         """Make the steps that are left; returns the checkpoint."""
         recipe, run, ranks, state, samples = self.recipe, self.run, self.ranks, self.state, self.source.samples
-        progress = tqdm(
-            total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
-        )
         losses: list[float] = []
         began_s, began = time.monotonic(), state.step
         saved_s = began_s
-        batches: Iterator[Sequence[Tensor]] = (
-            loaded(samples, state.step, recipe.steps, run.n_workers, ranks)
-            if isinstance(samples, Samples)
-            else map(samples.batch, range(state.step, last_step(recipe, state.curve, self.epoch)))
+        kept = TrainingLog(self.out, state.step, tensorboard=run.tensorboard) if ranks.is_first else nullcontext()
+        progress = tqdm(
+            total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
         )
-        folder = self.out if ranks.is_first else None
-        with TrainingLog(folder, state.step, tensorboard=run.tensorboard) as log, progress:
-            for arrays in batches:
+        with kept as log, progress:
+            for arrays in self._batches():
                 losses.append(self._step([array.to(ranks.device, non_blocking=True) for array in arrays]))
                 state.step += 1
                 _average(self.averaged, self.network, min(recipe.ema, (1 + state.step) / (10 + state.step)))
@@ -250,7 +185,8 @@ class _Training:
                 line["loss"] = round(float(np.mean(losses)), 5)
                 losses.clear()
                 state.curve.append(line | self._validated())
-                log.write(state.curve[-1] | {"samples_per_s": round(rate, 2)})
+                if log is not None:
+                    log.write(state.curve[-1] | {"samples_per_s": round(rate, 2)})
                 over = state.step >= last_step(recipe, state.curve, self.epoch)
                 if ranks.is_first and (over or time.monotonic() - saved_s >= run.save_every_s):
                     self._save()
@@ -259,24 +195,20 @@ class _Training:
                     break
         return self.checkpoint
 
-    def _validated(self) -> dict[str, Any]:
-        """The validation's part of a line of the log; the best weights are kept."""
-        recipe, state, watch = self.recipe, self.state, self.source.watch
-        if watch is None:
-            return {}
-        validated = watch.validate(self.averaged) if self.ranks.is_first else None
-        figure, loss, figures = self.ranks.from_first(validated) or (0.0, 0.0, {})
-        if figure > state.best_figure and self.stops:
-            state.best_figure, state.best = figure, copy.deepcopy(self.averaged.state_dict())
-        state.since_best = 0 if loss < state.lowest_loss else state.since_best + self.every
-        state.lowest_loss = min(state.lowest_loss, loss)
-        if recipe.halve_after and state.since_best >= recipe.halve_after * self.epoch:
-            state.halvings, state.since_best = state.halvings + 1, 0
-        return {"validation_loss": round(loss, 5), "validation": figures}
+    def _batches(self) -> Iterator[Sequence[Tensor]]:
+        recipe, state, samples = self.recipe, self.state, self.source.samples
+        if isinstance(samples, Samples):
+            return loaded(samples, state.step, recipe.steps, self.run.n_workers, self.ranks)
+        return map(samples.batch, range(state.step, last_step(recipe, state.curve, self.epoch)))
+
+    def _start(self, network: nn.Module, path: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+        """`start`, with the first batches for the statistics of batch norm."""
+        images = [torch.as_tensor(self.source.samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
+        return start(network, self.recipe, path, images)
 
     def _step(self, arrays: Sequence[Tensor]) -> float:
         """One step of the optimizer on a batch; returns the loss."""
-        recipe, ranks, source, task = self.recipe, self.ranks, self.source, self.source.task
+        recipe, ranks, source, task = self.recipe, self.ranks, self.source, self.source.samples.task
         for group in self.optimizer.param_groups:
             group["lr"] = recipe.learning_rate * make_schedule(recipe, self.state.step) * 0.5**self.state.halvings
         torch.manual_seed((recipe.seed << 32) + self.state.step)
@@ -307,6 +239,21 @@ class _Training:
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
         self.optimizer.step()
         return found
+
+    def _validated(self) -> dict[str, Any]:
+        """The validation's part of a line of the log; the best weights are kept."""
+        recipe, state, watch = self.recipe, self.state, self.source.watch
+        if watch is None:
+            return {}
+        validated = watch.validate(self.averaged) if self.ranks.is_first else None
+        figure, loss, figures = self.ranks.from_first(validated) or (0.0, 0.0, {})
+        if figure > state.best_figure and self.stops:
+            state.best_figure, state.best = figure, copy.deepcopy(self.averaged.state_dict())
+        state.since_best = 0 if loss < state.lowest_loss else state.since_best + self.every
+        state.lowest_loss = min(state.lowest_loss, loss)
+        if recipe.halve_after and state.since_best >= recipe.halve_after * self.epoch:
+            state.halvings, state.since_best = state.halvings + 1, 0
+        return {"validation_loss": round(loss, 5), "validation": figures}
 
     def _save(self) -> None:
         state, samples = self.state, self.source.samples
@@ -368,143 +315,6 @@ def _digest_of_file(path: Path | None) -> str:
     return "" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _image_source(recipe: Recipe, data: Data, device: torch.device) -> _Source:
-    """The training images of CamVid; the validation images are watched."""
-    if data.camvid is None:
-        raise ValueError(f"no images to train {recipe.network} on; give --camvid")
-    task = Camera.of(recipe)
-    samples, watch = camvid_samples(task, data.camvid, device)
-    labels = hashlib.sha256(samples.images.labels.cpu().numpy().tobytes()).hexdigest()
-    return _Source(task, samples, watch, samples.images.hashes, len(samples.images.hashes), {LABELS: labels})
-
-
-def _object_source(recipe: Recipe, folder: Path, data: Data, run: Run) -> _Source:
-    """Candidates of real and simulated scans, whose samples are kept in a folder; those of the fold are watched."""
-    task = Objects.of(recipe)
-    if not recipe.detector:
-        folder = folder.with_name(f"{folder.name}-of-groups")
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / ".lock"):  # a run on other scans replaces the samples
-        hashes = write_samples(
-            folder, data.kitti, data.simulated, data.scan_sets, run.n_workers, detector=recipe.detector
-        )
-        watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
-        trained = [name for name in hashes if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
-        if not trained:
-            raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
-        seen = {name: of for source in trained for name, of in hashes[source].items()}
-        watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in hashes else None
-        truth = " ".join((folder / f"{name}.sha256").read_text() for name in trained)
-        batches = ObjectBatches(task, load_samples(folder, trained), trained)
-    return _Source(task, batches, watch, seen, len(seen), {LABELS: truth})
-
-
-def _scan_source(recipe: Recipe, data: Data, run: Run, device: torch.device) -> _Source:
-    """Real and simulated scans, and the teacher."""
-    task, teacher, given = task_of(recipe), run.teacher, data.given
-    objects = KittiObjects(data.kitti) if data.kitti else None
-    real, weights, hashes, watched = (
-        _real(recipe, objects, data.scan_sets, data.fold)
-        if given is None
-        else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
-    )
-    paths = simulated_files(data.simulated) if data.simulated else []
-    seen_as = [(s.sensor and s.sensor.to_json(), np.round(s.azimuths, 4).tolist(), s.boxes_known) for s in real]
-    made_of = {LABELS: _digest_of_truth(real, paths), SENSOR: hashlib.sha256(repr(seen_as).encode()).hexdigest()}
-    _check_labels(task, real, simulated=bool(paths))
-    if recipe.distil > 0.0 and teacher is None:
-        raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
-    if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
-        raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
-    onnx_teacher = OnnxTeacher(teacher, task) if teacher is not None and teacher.suffix == ".onnx" else None
-    if onnx_teacher is not None and recipe.distil == 0.0:
-        raise ValueError(f"{teacher}: an exported teacher does not label scans; give its checkpoint.pt, or --distil")
-    teacher_network = None if teacher is None or onnx_teacher else _teacher(teacher, task).to(device)
-    if teacher_network is not None and objects is not None and recipe.distil == 0.0:
-        extra = unlabeled_scans(objects, data.fold)
-        real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
-        weights += [len(extra) ** -0.5] * len(extra)
-    samples = Samples(recipe, real, weights, paths, onnx_teacher, run.n_workers)
-    watch = Watch(samples, watched) if watched else None
-    # Every set in its share: the scans of a set follow one another.
-    few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
-    fitness = FitnessProfile.from_scans(few).to_dict() if few else None
-    return _Source(task, samples, watch, hashes, len(real), made_of, teacher_network, fitness)
-
-
-def _check_labels(task: Task, real: Sequence[LabeledScan], *, simulated: bool) -> None:
-    """Warn of classes that no scan shows, as those of a mistyped name; ValueError if none shows any."""
-    view = task.view
-    labels = (scan.top_view_truth(view) if isinstance(view, TopViewGeometry) else scan.labels for scan in real)
-    seen = {int(label) for each in labels for label in np.unique(each)} - {IGNORE}
-    if simulated:
-        own = task.recipe.classes
-        seen |= {*numbers_of_scene(own)[: len(SCENE_CLASSES)].tolist()} if own else {*range(len(task.classes))}
-    names = "see boxes and points in scans.json, and --classes"
-    if real and not seen:
-        raise ValueError(
-            f"no label of the {len(real)} scans to train on is of {', '.join(task.classes)}, so that nothing can be "
-            f"learned; {names}"
-        )
-    if lacking := [name for k, name in enumerate(task.classes) if k not in seen and seen]:
-        warnings.warn(f"no scan to train on has a label of {', '.join(lacking)}; {names}", stacklevel=2)
-
-
-def _digest_of_truth(real: Sequence[LabeledScan], simulated: Sequence[Path]) -> str:
-    """The SHA-256 of real scans' labels, and of simulated scans' names and sizes, in hexadecimal digits."""
-    digest = hashlib.sha256(repr([(path.name, path.stat().st_size) for path in simulated]).encode())
-    for scan in real:
-        # To the centimeter, as processors differ in the last digits of what a box was moved by.
-        boxes = [(box.label, np.round((*box.center, *box.size, box.yaw), 2).tolist()) for box in scan.boxes]
-        digest.update(repr((boxes, scan.counts)).encode() + scan.labels.tobytes() + scan.surface.tobytes())
-    return digest.hexdigest()
-
-
-def _real(
-    recipe: Recipe, kitti: KittiObjects | None, scan_sets: Sequence[ScanFolder], fold: int | None
-) -> tuple[list[LabeledScan], list[float], dict[str, str], list[LabeledScan]]:
-    """The real scans to train on, their weights and hashes, and the scans to watch."""
-    scans: list[LabeledScan] = []
-    weights: list[float] = []
-    hashes: dict[str, str] = {}
-    watched: list[LabeledScan] = []
-    watched_hashes: dict[str, str] = {}
-    only_simulated = recipe.simulated_share == 1.0
-    if kitti is not None:
-        names = kitti.names("train") if only_simulated else kitti.names("validation", fold=fold)
-        chosen = _few_of_each_drive(names, [kitti.drives[name] for name in names])
-        watched, _, watched_hashes = real_scans(kitti, chosen, classes=recipe.classes)
-        if not only_simulated:
-            names = kitti.names("train", fold=fold)
-            scans, weights, hashes = real_scans(kitti, names, drawn=recipe.drawn_roads, classes=recipe.classes)
-    classes = recipe.classes or POINT_CLASSES
-    for folder in scan_sets:
-        if not only_simulated:
-            check_trains(folder, "train", "validation", fold=fold)
-            more, more_weights, more_hashes = read_scan_set(folder, "train", fold, classes=classes)
-            scans, weights, hashes = scans + more, weights + more_weights, joined_hashes(hashes, more_hashes)
-        more, _, more_hashes = read_scan_set(folder, "validation", fold, classes=classes)
-        watched, watched_hashes = watched + more, joined_hashes(watched_hashes, more_hashes)
-    trained = {digest: name for name, digest in hashes.items()}
-    if twice := next((name for name, digest in watched_hashes.items() if digest in trained), None):
-        raise ValueError(
-            f"the validation scan {twice} is the training scan {trained[watched_hashes[twice]]}, byte for byte; its "
-            "figures would be too good. Remove one, or put both drives into one split"
-        )
-    return scans, weights, hashes, watched
-
-
-def _few_of_each_drive(names: Sequence[str], drives: Sequence[str]) -> list[str]:
-    """The names without most frames of long drives."""
-    chosen, seen = [], Counter[str]()
-    n_frames = Counter(drives)
-    for name, drive in zip(names, drives, strict=True):
-        if n_frames[drive] <= FEW_FRAMES or seen[drive] % VALIDATION_STRIDE == 0:
-            chosen.append(name)
-        seen[drive] += 1
-    return chosen
-
-
 def last_step(recipe: Recipe, curve: Sequence[dict[str, Any]], epoch: int) -> int:
     """The last step: that of the recipe, or where the validation figure has not improved for ``stop_after`` epochs."""
     figures = [row["validation"]["mean"] or 0.0 for row in curve] if recipe.stop_after else []
@@ -535,29 +345,6 @@ def make_optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
         for decays, decay in ((True, recipe.weight_decay), (False, 0.0))
     ]
     return torch.optim.AdamW(groups, lr=recipe.learning_rate)
-
-
-class _Teacher(nn.Module):
-    """A network that sees some channels of another network's input."""
-
-    def __init__(self, network: nn.Module, channels: Sequence[int]) -> None:
-        super().__init__()
-        self.network, self.channels = network, list(channels)
-
-    def forward(self, x: Tensor) -> Any:
-        return self.network(x[:, self.channels])
-
-
-def _teacher(checkpoint: Path, task: Task) -> nn.Module:
-    """The network of a checkpoint with the same view as the task, and with the same channels or fewer."""
-    state = read_checkpoint(checkpoint)
-    recipe = state["recipe"]
-    seen, own = (
-        list(zip(spec.channels, spec.mean, spec.std, strict=True)) for spec in (task.input, task_of(recipe).input)
-    )
-    if task_of(recipe).view != task.view or not set(own) <= set(seen):
-        raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
-    return _Teacher(build_network(state, checkpoint), [seen.index(channel) for channel in own]).eval()
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from database_helpers import simulated_kitti
 from filelock import FileLock
 from tiny_model import tiny_card
 from torch import Tensor, nn
-from training_helpers import ablate, interrupted_in_step, make, train
+from training_helpers import ablate, interrupted_in_step, losses_of_steps, make, train
 
 from checkout import REPOSITORY
 from cli_helpers import Shell
@@ -50,7 +50,7 @@ from edgeperc_export import make as make_module
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.data.augment import ObjectBank
 from edgeperc_export.data.roads import DRAWN, drawn_roads
-from edgeperc_export.data.scan_sets import seen_by_network
+from edgeperc_export.data.scan_sets import Labeled, seen_by_network
 from edgeperc_export.data.scans import LabeledScan, mirrored
 from edgeperc_export.data.simulate import parity_samples, simulate
 from edgeperc_export.networks import build
@@ -70,8 +70,8 @@ from edgeperc_export.release.to_onnx import (
 )
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
-from edgeperc_export.training.log import curve_table
-from edgeperc_export.training.samples import RealScans, Recent, Samples, Watch, loaded, real_scans
+from edgeperc_export.training.checkpoint import read_checkpoint
+from edgeperc_export.training.samples import Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Points, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
@@ -108,6 +108,19 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def samples_of(recipe: Recipe, simulated: Path, teacher: OnnxTeacher | None = None) -> Samples:
+    return Samples(recipe, [], [], sorted(simulated.glob("*.npz")), teacher)
+
+
+def alone(scan: LabeledScan, hashes: dict[str, str]) -> Any:
+    """A scan to train on, and none to watch."""
+    return Labeled([scan], [1.0], hashes), []
+
+
+def logged(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
 @pytest.fixture
 def small_views(monkeypatch: pytest.MonkeyPatch) -> None:
     make_views_small(monkeypatch)
@@ -142,7 +155,12 @@ def untrained(network: str, folder: Path, **changes: object) -> Path:
 
 
 def weights(path: Path) -> dict[str, Tensor]:
-    return torch.load(path, weights_only=True)["averaged"]
+    return read_checkpoint(path)["averaged"]
+
+
+def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
+    for name, value in one.items():
+        assert torch.equal(value, other[name]), name
 
 
 def test_a_network_of_half_precision_is_told_how_to_take_scans(tmp_path: Path) -> None:
@@ -182,39 +200,33 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     tmp_path: Path, simulated: Path, network: str, changes: dict[str, object], n_workers: int
 ) -> None:
     recipe = small(network, steps=3, redraw_every=1, **changes)
-    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
+    arguments = {"simulated": simulated, "checkpoint_every": 2}
     whole = train(recipe, tmp_path / "whole", **arguments)  # without workers: they change nothing
-    arguments["n_workers"] = n_workers
-
     with interrupted_in_step(3, type(task_of(recipe))):  # when there is a checkpoint of the second
-        train(recipe, tmp_path / "cut", **arguments)
-    resumed = weights(train(recipe, tmp_path / "cut", **arguments))
-    for name, value in weights(whole).items():
-        assert torch.equal(value, resumed[name]), name
-    log = [json.loads(line) for line in (tmp_path / "whole/log.jsonl").read_text().splitlines()]
-    assert all(np.isfinite(line["loss"]) for line in log)
+        train(recipe, tmp_path / "cut", n_workers=n_workers, **arguments)
+    assert_equal(weights(whole), weights(train(recipe, tmp_path / "cut", n_workers=n_workers, **arguments)))
+    assert all(np.isfinite(line["loss"]) for line in logged(tmp_path / "whole"))
 
 
 @pytest.mark.usefixtures("small_views")
 def test_a_run_may_keep_a_share_of_the_weights_that_it_starts_from(tmp_path: Path, simulated: Path) -> None:
     begun = untrained("pointseg", tmp_path, edge=True)
-    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "start_from": begun}
+    start = {"simulated": simulated, "start_from": begun}
     recipes = [small("pointseg", edge=True, kept=kept, steps=2, n_pasted=0.0) for kept in (0.0, 0.25)]
-    own, mixed = (weights(train(recipe, tmp_path / f"{recipe.kept}", **arguments)) for recipe in recipes)
+    own, mixed = (weights(train(recipe, tmp_path / f"{recipe.kept}", **start)) for recipe in recipes)
     for name, before in weights(begun).items():
         if before.dtype.is_floating_point:
             assert torch.allclose(mixed[name], 0.75 * own[name] + 0.25 * before, atol=1e-5), name
     with pytest.raises(ValueError, match="give --start-from"):
-        train(replace(recipes[0], kept=0.5), tmp_path / "none", **{**arguments, "start_from": None})
-    other = {**arguments, "start_from": tmp_path / "0.0/checkpoint.pt"}
+        train(replace(recipes[0], kept=0.5), tmp_path / "none", simulated=simulated)
     with pytest.raises(ValueError, match="of a run with another --start-from; give the same or"):
-        train(recipes[1], tmp_path / "0.25", **other)
+        train(recipes[1], tmp_path / "0.25", simulated=simulated, start_from=tmp_path / "0.0/checkpoint.pt")
 
 
 @pytest.mark.usefixtures("small_views")
 def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Path) -> None:
     recipe = small("pointseg", edge=True, steps=7, batch=2, reuse=3, redraw_every=0)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(recipe, simulated)
     batches = [[part.clone() for part in batch] for batch in loaded(samples, 0, recipe.steps, 0)]
     assert len(batches) == recipe.steps
     seen: list[Tensor] = []
@@ -225,7 +237,7 @@ def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Pat
         else:
             numbers = [next(k for k, other in enumerate(seen) if torch.equal(one, other)) for one in image]
             assert len(set(numbers)) == 2
-    assert train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1).exists()
+    assert train(recipe, tmp_path, simulated=simulated).exists()
 
 
 def test_recent_samples_replace_the_oldest() -> None:
@@ -239,12 +251,17 @@ def test_recent_samples_replace_the_oldest() -> None:
 
 
 def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: Path) -> None:
+    """Also after a simulation that was stopped, whose scans are kept."""
+    simulate(tmp_path / "0", 1)
+    stamp = (tmp_path / "0/000000.npz").stat().st_mtime_ns
     for n_workers in (0, 2):
         simulate(tmp_path / str(n_workers), 3, n_workers=n_workers)
+    assert (tmp_path / "0/000000.npz").stat().st_mtime_ns == stamp
     ours, theirs = (sorted((tmp_path / folder).glob("*.npz")) for folder in ("0", "2"))
     assert [path.name for path in ours] == [path.name for path in theirs]
     assert all(one.read_bytes() == other.read_bytes() for one, other in zip(ours, theirs, strict=True))
     scans = [LabeledScan.load(path) for path in ours]
+    assert len(scans[1].points) > 50_000
     bank, other_bank = (ObjectBank.of(scans, n_workers=n_workers) for n_workers in (0, 2))
     assert list(bank.objects) == list(other_bank.objects)
     for name, objects in bank.objects.items():
@@ -254,59 +271,48 @@ def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: 
 
 
 @pytest.mark.usefixtures("small_views")
-def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None:
-    recipe = small("pointseg", edge=True, steps=1, n_pasted=0.0)
-    train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1)
-    with pytest.raises(ValueError, match="of another recipe: steps 1, now 2; give the same options"):
-        train(replace(recipe, steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
-    lock = FileLock(tmp_path / ".lock")
-    with lock, pytest.raises(ValueError, match="another training runs in"):
-        train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1)
-
-
-@pytest.mark.usefixtures("small_views")
-def test_other_data_do_not_resume(tmp_path: Path, simulated: Path) -> None:
+def test_another_recipe_and_other_data_do_not_resume(tmp_path: Path, simulated: Path) -> None:
     """The card would not know the scans of the second run, and the fold was trained on."""
     recipe = small("pointseg", edge=True, steps=1, n_pasted=0.0)
     scan = LabeledScan.load(sorted(simulated.glob("*.npz"))[0])
     scan = replace(scan, labels=np.zeros_like(scan.labels))
-    given = RealScans([scan], {"a": "1"}, [])
+    given = alone(scan, {"a": "1"})
 
-    def run(folder: str, **changes: Any) -> Path:
-        arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "given": given, **changes}
-        return train(recipe, tmp_path / folder, **arguments)
+    def run(folder: str, recipe: Recipe = recipe, **changes: Any) -> Path:
+        return train(recipe, tmp_path / folder, **{"simulated": simulated, "given": given, **changes})
+
+    def refused(message: str, folder: str = "own", **changes: Any) -> None:
+        with pytest.raises(ValueError, match=message):
+            run(folder, **changes)
 
     first = run("own")
     assert run("own") == first
+    with FileLock(tmp_path / "own/.lock"):
+        refused("another training runs in")
+    refused("of another recipe: steps 1, now 2; give the same options", recipe=replace(recipe, steps=2))
     fewer = tmp_path / "fewer"
     fewer.mkdir()
     shutil.copy(sorted(simulated.glob("*.npz"))[0], fewer)
-    for changes in ({"given": RealScans([scan], {"b": "2"}, [])}, {"fold": 0}, {"simulated": fewer}):
-        with pytest.raises(ValueError, match="of a run on other data"):
-            run("own", **changes)
+    for changes in ({"given": alone(scan, {"b": "2"})}, {"fold": 0}, {"simulated": fewer}):
+        refused("of a run on other data", **changes)
     corrected = replace(scan, labels=np.ones_like(scan.labels))
-    with pytest.raises(ValueError, match="of a run with another truth of its scans"):
-        run("own", given=RealScans([corrected], given.hashes, []))
-    with pytest.raises(ValueError, match="of a run with another sensor or labeled sector"):
-        run("own", given=RealScans([replace(scan, azimuths=(-1.0, 1.0))], given.hashes, []))
+    refused("of a run with another truth of its scans", given=alone(corrected, {"a": "1"}))
+    aside = replace(scan, azimuths=(-1.0, 1.0))
+    refused("of a run with another sensor or labeled sector", given=alone(aside, {"a": "1"}))
     # Another scan of the same name: the card knows both.
-    run("after", start_from=first, given=RealScans([scan], {"a": "2"}, []))
+    run("after", start_from=first, given=alone(scan, {"a": "2"}))
     frames = load(tmp_path / "after/checkpoint.pt")[2]["frames"]
     assert sorted(frames.values()) == ["1", "2"]
-    with pytest.raises(ValueError, match="of a run on other data"):
-        run("after", start_from=first, given=RealScans([scan], {"a": "3"}, []))
+    refused("of a run on other data", "after", start_from=first, given=alone(scan, {"a": "3"}))
 
 
 @pytest.mark.usefixtures("small_views")
 def test_a_longer_run_starts_like_a_shorter_one(tmp_path: Path, simulated: Path) -> None:
-    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
     for run, steps in (("short", 4), ("long", 6)):
-        train(small("pointseg", edge=True, steps=steps, cooldown=0.5, n_pasted=0.0), tmp_path / run, **arguments)
-    one, other = (
-        [json.loads(line)["loss"] for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
-        for run in ("short", "long")
-    )
-    assert one[0] == other[0]  # of steps 1 and 2, before either cools down
+        recipe = small("pointseg", edge=True, steps=steps, cooldown=0.5, n_pasted=0.0)
+        train(recipe, tmp_path / run, simulated=simulated, checkpoint_every=2)
+    one, other = logged(tmp_path / "short"), logged(tmp_path / "long")
+    assert one[0]["loss"] == other[0]["loss"]  # of steps 1 and 2, before either cools down
     assert len(other) == 3
 
 
@@ -353,7 +359,7 @@ def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
 ) -> None:
     path, network = SHIPPED_MODELS / f"{model}.onnx", build(recipe)
     task = task_of(recipe)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(recipe, simulated)
     image = torch.from_numpy(samples.batch(0)[0])
     before, frames = start(network, recipe, path, [image])
     session = Session(path, "cpu", n_threads=1)
@@ -387,22 +393,22 @@ def as_tuple(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 )
 def test_classes_of_a_start_keep_their_weights(simulated: Path, classes: tuple[str, ...]) -> None:
     """As many classes, or in another order, as well: they took the weights in the place of theirs."""
-    path = SHIPPED_MODELS / "pointseg.onnx"
     recipe = Recipe("pointseg", edge=True, batch=1, classes=classes)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
-    assert set(np.unique(samples.batch(0)[1])) <= {0, 2, len(classes) - 1, IGNORE}  # cars are of no class of this one
-    image = torch.from_numpy(samples.batch(0)[0])
-    own, shipped = build(recipe), build(replace(recipe, classes=()))
-    start(own, recipe, path, [image])
-    start(shipped, replace(recipe, classes=()), path, [image])
-    with torch.no_grad():
-        ours, theirs = own.eval()(image), shipped.eval()(image)
+    image, labels = samples_of(recipe, simulated).batch(0)
+    assert set(np.unique(labels)) <= {0, 2, len(classes) - 1, IGNORE}  # cars are of no class of this one
+
+    def logits(recipe: Recipe) -> Tensor:
+        network, images = build(recipe), [torch.from_numpy(image)]
+        start(network, recipe, SHIPPED_MODELS / "pointseg.onnx", images)
+        with torch.no_grad():
+            found: Tensor = network.eval()(*images)
+        return found
+
+    ours, theirs = logits(recipe), logits(replace(recipe, classes=()))
     assert torch.equal(ours[:, [0, 2]], theirs[:, [0, 2]])
     assert not ours[:, 1].any()
-    moved = replace(recipe, classes=("background", "pedestrian", "car", "cyclist"))
-    start(own := build(moved), moved, path, [image])
-    with torch.no_grad():
-        assert torch.equal(own.eval()(image), theirs[:, [0, 2, 1, 3]])
+    moved = logits(replace(recipe, classes=("background", "pedestrian", "car", "cyclist")))
+    assert torch.equal(moved, theirs[:, [0, 2, 1, 3]])
 
 
 @pytest.mark.usefixtures("small_views")
@@ -419,36 +425,27 @@ def test_a_start_shares_whole_layers_or_none(tmp_path: Path) -> None:
 def test_head_only_trains_only_the_head(tmp_path: Path, simulated: Path) -> None:
     start = untrained("ssadnet", tmp_path)
     recipe = small("ssadnet", head="slots", head_only=True, steps=2, ema=0.0, n_pasted=0.0)
-    state = torch.load(
-        train(recipe, tmp_path / "run", kitti=None, simulated=simulated, start_from=start, n_threads=1),
-        weights_only=True,
-    )["network"]
+    state = read_checkpoint(train(recipe, tmp_path / "run", simulated=simulated, start_from=start))["network"]
     drawn, given = build(recipe).state_dict(), weights(start)
-    for name, value in state.items():
-        if name.startswith("segmentation"):
-            assert torch.equal(value, given[name]), name
+    assert_equal({name: value for name, value in state.items() if name.startswith("segmentation")}, given)
     assert any(not torch.equal(value, drawn[name]) for name, value in state.items() if name.startswith("detection"))
 
 
 def test_the_papers_recipes_match_the_papers() -> None:
     """SSADNet 3.2, PointSeg 5 and LoDNN-I 3.3 to 3.6, without settings that they do not mention."""
-    ssadnet, pointseg = PAPER["ssadnet"], PAPER["pointseg"]
-    assert (ssadnet.head, ssadnet.optimizer, ssadnet.learning_rate) == ("slots-paper", "adam", 1e-5)
-    assert ssadnet.batch == 8
-    assert ssadnet.halve_after == 100
-    assert (pointseg.optimizer, pointseg.learning_rate, pointseg.batch, pointseg.steps) == ("adagrad", 1e-3, 32, 50_000)
-    for recipe in (ssadnet, pointseg):
-        assert not recipe.augment
-        assert recipe.n_pasted == recipe.swap == recipe.ema == recipe.lovasz_weight == recipe.simulated_share == 0.0
-    lodnn = PAPER["lodnn"]
-    assert (lodnn.optimizer, lodnn.learning_rate, lodnn.batch, lodnn.context_width) == ("adam", 1e-3, 16, 128)
-    assert lodnn.steps == 22 * 300 * 8 // 16  # epochs, scenes, variations
-    assert lodnn.drawn_roads
-    assert lodnn.augment
-    assert lodnn.n_pasted == lodnn.ema == lodnn.lovasz_weight == lodnn.simulated_share == lodnn.distil == 0.0
-    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(lodnn).modules())
-    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
-    assert type(make_optimizer(pointseg, build(pointseg))) is torch.optim.Adagrad
+    expected = {
+        "ssadnet": {"head": "slots-paper", "optimizer": "adam", "learning_rate": 1e-5, "batch": 8, "halve_after": 100},
+        "pointseg": {"optimizer": "adagrad", "learning_rate": 1e-3, "batch": 32, "steps": 50_000},
+        "lodnn": {"optimizer": "adam", "learning_rate": 1e-3, "batch": 16, "context_width": 128, "drawn_roads": True}
+        | {"steps": 22 * 300 * 8 // 16},  # epochs, scenes, variations
+    }
+    unmentioned = ("n_pasted", "swap", "ema", "lovasz_weight", "simulated_share", "distil")
+    for name, settings in expected.items():
+        settings |= {"augment": name == "lodnn", **dict.fromkeys(unmentioned, 0.0)}
+        assert {setting: getattr(PAPER[name], setting) for setting in settings} == settings
+    for network in (build(PAPER["lodnn"]), build(PAPER["ssadnet"]).segmentation):
+        assert not any(isinstance(m, nn.BatchNorm2d) for m in network.modules())
+    assert type(make_optimizer(PAPER["pointseg"], build(PAPER["pointseg"]))) is torch.optim.Adagrad
 
 
 @pytest.fixture(scope="module")
@@ -466,19 +463,17 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_fold_is_for_validation_and_not_for_training(
     tmp_path: Path, kitti: Path, simulated: Path, network: str
 ) -> None:
-    arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
-    checkpoint = train(small(network, edge=True, steps=2, n_pasted=0.0), tmp_path, **arguments)
-    state = torch.load(checkpoint, weights_only=True)
-    assert json.loads(state["frames"]).keys() == {"000000"}  # of fold 0
-    curve = json.loads(state["curve"])
-    assert [line["step"] for line in curve] == [1, 2]
-    assert all(0.0 <= line["validation"]["background"] <= 1.0 for line in curve)
-    assert all(np.isfinite(line["validation_loss"]) for line in curve)
+    recipe = small(network, edge=True, steps=2, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, checkpoint_every=1)
+    state = read_checkpoint(checkpoint)
+    assert state["frames"].keys() == {"000000"}  # of fold 0
+    assert [line["step"] for line in state["curve"]] == [1, 2]
+    assert all(0.0 <= line["validation"]["background"] <= 1.0 for line in state["curve"])
+    assert all(np.isfinite(line["validation_loss"]) for line in state["curve"])
     assert state["best"].keys() == state["averaged"].keys()
     network_, _, notes = load(checkpoint)
-    assert notes["curve"] == curve
-    for name, value in network_.state_dict().items():
-        assert torch.equal(value, state["best"][name])
+    assert notes["curve"] == state["curve"]
+    assert_equal(network_.state_dict(), state["best"])
 
 
 def test_drawn_roads_are_of_training_drives() -> None:
@@ -513,8 +508,7 @@ def test_a_drawn_road_is_the_ground_truth_of_its_scan(kitti: Path, monkeypatch: 
 
 
 def test_lodnn_learns_only_road(simulated: Path) -> None:
-    recipe = small("lodnn", edge=True)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(small("lodnn", edge=True), simulated)
     scan = LabeledScan.load(samples.simulated[0])
     image, truth = samples.sample(scan)
     assert image.shape == (3, 400, 200)
@@ -522,18 +516,14 @@ def test_lodnn_learns_only_road(simulated: Path) -> None:
     np.testing.assert_array_equal(truth == 1, whole == 1)
     np.testing.assert_array_equal(truth == IGNORE, whole == IGNORE)
     assert (truth[(whole > 1) & (whole != IGNORE)] == 0).all()
-    labels = torch.from_numpy(truth[None])
-    right = torch.stack([labels == 0, labels == 1], dim=1).float() * 20.0
-    assert samples.task.loss(right, [labels]) < 1e-3
-    assert samples.task.loss(-right, [labels]) > 10.0
 
 
 @pytest.mark.usefixtures("small_views")
 def test_a_simulated_share_of_1_uses_no_real_frame(tmp_path: Path, kitti: Path, simulated: Path) -> None:
     recipe = small("pointseg", edge=True, steps=1, simulated_share=1.0, n_pasted=0.0)
-    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, n_threads=1)
-    assert load(checkpoint)[2]["frames"] == {}
-    assert json.loads(torch.load(checkpoint, weights_only=True)["curve"])[0]["validation"].keys() >= {"car"}
+    state = read_checkpoint(train(recipe, tmp_path, kitti=kitti, simulated=simulated))
+    assert state["frames"] == {}
+    assert state["curve"][0]["validation"].keys() >= {"car"}
 
 
 @pytest.mark.usefixtures("small_views")
@@ -542,8 +532,7 @@ def test_the_learning_rate_is_halved_after_epochs_without_improvement(
 ) -> None:
     monkeypatch.setattr(Watch, "validate", lambda self, network: (0.5, 1.0, {"car": 0.5}))
     recipe = small("pointseg", edge=True, steps=4, halve_after=2, n_pasted=0.0)
-    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
-    state = torch.load(checkpoint, weights_only=True)
+    state = read_checkpoint(train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, checkpoint_every=1))
     assert state["watched"][-1] == 1  # at step 3, two epochs of one step after the first and best
     assert state["optimizer"]["param_groups"][0]["lr"] < 0.6 * recipe.learning_rate
 
@@ -579,7 +568,7 @@ def test_a_teacher_labels_unlabeled_points(kitti: Path) -> None:
 def test_deep_supervision_is_only_for_training(simulated: Path) -> None:
     recipe = small("pointseg", deep_supervision=0.4)
     network = build(recipe)
-    inputs, truth = (torch.from_numpy(a) for a in Samples(recipe, [], [], sorted(simulated.glob("*.npz"))).batch(0))
+    inputs, truth = (torch.from_numpy(a) for a in samples_of(recipe, simulated).batch(0))
     logits, early = network.train()(inputs)
     assert early.shape == (1, 4, 16, 32)
     plain = task_of(replace(recipe, deep_supervision=0.0)).loss(logits, [truth])
@@ -616,29 +605,23 @@ def test_a_teacher_averages_a_scene_and_its_mirror_image() -> None:
 def test_a_network_is_distilled_from_a_teacher(
     tmp_path: Path, simulated: Path, network: str, edge: bool, teacher_network: str
 ) -> None:
-    recipe = small(network, steps=1, distil=1.0, edge=edge, n_pasted=0.0)
-    teacher = untrained(teacher_network, tmp_path, seed=9)
-    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1}
-    with pytest.raises(ValueError, match=r"distils \(1\) but there is no teacher; give --teacher"):
-        train(recipe, tmp_path / "none", **arguments)
-    losses = []
-    for distil in (0.0, 1.0):
-        out = tmp_path / f"distil{distil:g}"
-        train(replace(recipe, distil=distil), out, teacher=teacher if distil else None, **arguments)
-        losses.append(json.loads((out / "log.jsonl").read_text())["loss"])
-    assert losses[1] > losses[0] + 0.1
+    recipe, teacher = small(network, steps=1, edge=edge, n_pasted=0.0), untrained(teacher_network, tmp_path, seed=9)
+    train(recipe, tmp_path / "alone", simulated=simulated)
+    train(replace(recipe, distil=1.0), tmp_path / "taught", simulated=simulated, teacher=teacher)
+    assert logged(tmp_path / "taught")[0]["loss"] > logged(tmp_path / "alone")[0]["loss"] + 0.1
 
 
 @pytest.mark.usefixtures("small_views")
 def test_an_unused_or_unsuitable_teacher_is_refused(tmp_path: Path, simulated: Path) -> None:
-    arguments = {"kitti": None, "simulated": simulated, "teacher": untrained("pointseg", tmp_path, edge=True)}
-    with pytest.raises(ValueError, match="the teacher is not used; give --distil"):
-        train(small("pointseg", n_pasted=0.0), tmp_path, **arguments)
-    with pytest.raises(ValueError, match="is of pointseg, which sees another view than lodnn"):
-        train(small("lodnn", distil=1.0, n_pasted=0.0), tmp_path, **arguments)
-    slots = untrained("ssadnet", tmp_path, head="slots")
-    with pytest.raises(ValueError, match="the teacher has no dense boxes"):
-        train(small("ssadnet", edge=True, distil=1.0, n_pasted=0.0), tmp_path, **arguments | {"teacher": slots})
+    points, slots = untrained("pointseg", tmp_path, edge=True), untrained("ssadnet", tmp_path, head="slots")
+    for recipe, teacher, message in (
+        (small("pointseg", distil=1.0), None, r"distils \(1\) but there is no teacher; give --teacher"),
+        (small("pointseg", n_pasted=0.0), points, "the teacher is not used; give --distil"),
+        (small("lodnn", distil=1.0, n_pasted=0.0), points, "is of pointseg, which sees another view than lodnn"),
+        (small("ssadnet", edge=True, distil=1.0, n_pasted=0.0), slots, "the teacher has no dense boxes"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train(recipe, tmp_path, simulated=simulated, teacher=teacher)
 
 
 @pytest.mark.parametrize("network", ["pointseg", "ssadnet", "lodnn"])
@@ -646,7 +629,7 @@ def test_an_exported_teacher_answers_with_each_sample(simulated: Path, network: 
     path = SHIPPED_MODELS / ("pointseg.onnx" if network == "pointseg" else "ssadnet.onnx")
     recipe = small(network, edge=True, distil=1.0, seen_twice=False, height_above_ground=network == "pointseg")
     task = task_of(recipe)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")), OnnxTeacher(path, task))
+    samples = samples_of(recipe, simulated, OnnxTeacher(path, task))
     arrays = [torch.from_numpy(array) for array in samples.batch(0)]
     image, taught = arrays[0], arrays[1 + samples.n_targets :]
     assert len(taught) == (2 if network == "ssadnet" else 1)
@@ -668,9 +651,8 @@ def test_a_run_with_an_exported_teacher_equals_one_with_workers(
 ) -> None:
     _, teacher, _ = exported("pointseg", "dense")
     recipe = small("pointseg", edge=True, distil=1.0, steps=2, n_pasted=0.0)
-    arguments = {"kitti": None, "simulated": simulated, "teacher": teacher, "n_threads": 1}
-    one, other = (weights(train(recipe, tmp_path / f"with-{n}", n_workers=n, **arguments)) for n in (0, 1))
-    assert all(torch.equal(value, other[name]) for name, value in one.items())
+    given = {"simulated": simulated, "teacher": teacher}
+    assert_equal(*(weights(train(recipe, tmp_path / f"with-{n}", n_workers=n, **given)) for n in (0, 1)))
     with pytest.raises(ValueError, match="sees another view than lodnn"):
         OnnxTeacher(teacher, task_of(small("lodnn")))
 
@@ -700,21 +682,6 @@ def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: P
     again.redraw(Blind(), 1000)
     for name in ("real", "simulated"):
         np.testing.assert_array_equal(samples.odds[name], again.odds[name])
-
-
-@pytest.mark.usefixtures("small_views")
-def test_the_curve_of_a_run_is_a_table(tmp_path: Path, kitti: Path, simulated: Path) -> None:
-    arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
-    train(small("pointseg", edge=True), tmp_path, **arguments)
-    with (tmp_path / "log.jsonl").open("a") as log:  # as after a second run, which was killed
-        log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + '\n{"step": 5, ')
-    head, names, *rows, gain = curve_table(tmp_path, 2)
-    assert head == f"{tmp_path}: 4 lines of the log, means of 2"
-    assert names.split() == ["samples", "loss", "car", "pedestrian", "cyclist"]
-    assert [row.split()[0] for row in rows] == ["2", "4"]
-    assert gain.split()[:2] == ["last", "quarter"]
-    with pytest.raises(ValueError, match="has no line"):
-        list(curve_table(tmp_path / "nothing"))
 
 
 @pytest.mark.usefixtures("small_views")
@@ -802,49 +769,32 @@ def test_make_also_makes_the_models_that_it_starts_from(
 @pytest.mark.parametrize(("network", "focal_gamma"), [("pointseg", 0.0), ("kulseg", 2.0)])
 def test_training_lowers_the_loss(simulated: Path, network: str, focal_gamma: float) -> None:
     recipe = small(network, steps=12, learning_rate=3e-3, focal_gamma=focal_gamma)
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(recipe, simulated)
     inputs, truth = (torch.from_numpy(a) for a in samples.batch(0))
-    net = build(recipe)
-    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
-    losses = []
-    for _ in range(8):
-        loss = samples.task.loss(net(inputs), [truth])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
+    losses = losses_of_steps(build(recipe), lambda net: samples.task.loss(net(inputs), [truth]), 8, 3e-3)
     assert losses[-1] < 0.8 * losses[0]
 
 
 @pytest.mark.usefixtures("small_views")
 def test_a_step_always_draws_the_same_samples(simulated: Path) -> None:
-    samples = Samples(small("ssadnet"), [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(small("ssadnet"), simulated)
     for one, other in zip(samples.batch(5), samples.batch(5), strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(samples.batch(5)[0], samples.batch(6)[0])
 
 
 def test_an_empty_scan_is_a_sample_without_ground_truth(simulated: Path) -> None:
-    files = sorted(simulated.glob("*.npz"))
-    scan = LabeledScan.load(files[0])
-    nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
-    image, truth = Samples(small("pointseg"), [], [], files).sample(nothing)
+    samples = samples_of(small("pointseg"), simulated)
+    scan = LabeledScan.load(samples.simulated[0])
+    image, truth = samples.sample(replace(scan, points=scan.points[:0], labels=scan.labels[:0]))
     assert not image.any()
     assert (truth == IGNORE).all()
-    full_image, full_truth = Samples(small("pointseg"), [], [], files).sample(scan)
+    full_image, full_truth = samples.sample(scan)
     empty = (full_image == 0.0).all(axis=0)
     assert (full_truth[empty] == IGNORE).all()
     # Without a point of unknown class, such as those of a tram, every other pixel is labeled.
     known = replace(scan, labels=np.where(scan.labels == IGNORE, 0, scan.labels).astype(np.uint8))
-    assert ((Samples(small("pointseg"), [], [], files).sample(known)[1] == IGNORE) == empty).all()
-
-
-def test_a_stopped_simulation_resumes(tmp_path: Path) -> None:
-    simulate(tmp_path, 1)
-    stamp = (tmp_path / "000000.npz").stat().st_mtime_ns
-    simulate(tmp_path, 2)
-    assert (tmp_path / "000000.npz").stat().st_mtime_ns == stamp
-    assert len(LabeledScan.load(tmp_path / "000001.npz").points) > 50_000
+    assert ((samples.sample(known)[1] == IGNORE) == empty).all()
 
 
 def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp_path: Path) -> None:
@@ -885,7 +835,7 @@ def test_a_run_tells_of_what_it_cannot_learn(
     for network in ("pointseg", "ssadnet", "lodnn"):
         nothing = replace(scan, labels=np.full_like(scan.labels, IGNORE), azimuths=(3.0, 3.1))
         with pytest.raises(ValueError, match=r"no label of the 1 scans to train on is of background, .*; see boxes"):
-            train(small(network, edge=True), tmp_path, kitti=None, given=RealScans([nothing], {"a": "1"}, []))
+            train(small(network, edge=True), tmp_path, given=alone(nothing, {"a": "1"}))
 
 
 @pytest.fixture(scope="module")
@@ -957,17 +907,13 @@ def test_a_graph_that_disagrees_is_not_written(
         export(checkpoint, path, scans=scans, fitness=None)
     assert path.read_bytes() == b"the model before"
     assert [p.name for p in tmp_path.iterdir()] == ["model.onnx"]
-
-
-def test_verify_detects_another_network(exported: Exported, scans: Sequence[np.ndarray]) -> None:
-    checkpoint, path, _ = exported("pointseg", "dense")
     network = load(checkpoint)[0]
-    assert verify(network, path, scans)["label_agreement"] > 0.999
+    assert verify(network, right, scans)["label_agreement"] > 0.999
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.mul_(1.01)
     with pytest.raises(ParityError):
-        verify(network, path, scans)
+        verify(network, right, scans)
 
 
 def test_figures_written_later_change_only_the_card(tmp_path: Path, exported: Exported) -> None:
@@ -1020,15 +966,21 @@ def card_command(folder: Path, path: Path, card: ModelCard, encoding: str = "utf
     return "card", path, folder / "card.json", folder / "out.onnx"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_a_third_party_network_runs_with_a_card(
-    tmp_path: Path, scans: Sequence[np.ndarray], third_party: tuple[Path, ModelCard], shell: Shell
+    encoding: str, tmp_path: Path, scans: Sequence[np.ndarray], third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
-    shell.out(*card_command(tmp_path, *third_party))
-    out = tmp_path / "out.onnx"
-    answer = Perceiver(out, provider="cpu")(scans[0])
-    assert answer.require_points().classes == ("nothing", "tree", "car")
-    assert answer.require_points().in_view.mean() > 0.9  # all around
-    assert len(np.unique(answer.require_points().labels[answer.require_points().in_view])) > 1
+    """In an encoding of Windows too: its shell and editors write these, such as for ``edgeperc info NAME --json``."""
+    (path, card), out = third_party, tmp_path / "out.onnx"
+    shell.out(*card_command(tmp_path, path, replace(card, version="2é"), encoding))
+    assert ModelCard.read(out).version == "2é"
+    points = Perceiver(out, provider="cpu")(scans[0]).require_points()
+    assert points.classes == ("nothing", "tree", "car")
+    assert points.in_view.mean() > 0.9  # all around
+    assert len(np.unique(points.labels[points.in_view])) > 1
+    write_card(onnx.load(out), card, out)  # it replaces the one before
+    assert [p.key for p in onnx.load(out).metadata_props].count(CARD_KEY) == 1
+    assert Session(out, "cpu").card.version == card.version
 
 
 def test_a_card_that_does_not_fit_writes_nothing(
@@ -1087,31 +1039,19 @@ def test_a_graph_that_does_not_fit_is_told_of(
     assert re.search(message, shell.err(*card_command(tmp_path, tmp_path / "wrong.onnx", card)))
 
 
-def test_weights_that_stayed_elsewhere_are_told_of(
+def test_weights_that_stayed_elsewhere_and_a_card_that_is_no_text_are_told_of(
     tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
 ) -> None:
-    """PyTorch writes them beside the graph, in a file that is easily left behind; that was a traceback."""
+    """PyTorch writes weights beside the graph, in a file that is easily left behind; that was a traceback."""
     path, card = third_party
-    model = onnx.load(path)
-    onnx.save(model, tmp_path / "network.onnx", save_as_external_data=True, location="weights", size_threshold=0)
+    onnx.save(
+        onnx.load(path), tmp_path / "network.onnx", save_as_external_data=True, location="weights", size_threshold=0
+    )
     command = card_command(tmp_path, tmp_path / "network.onnx", card)
     shell.out(*command)
     (tmp_path / "weights").unlink()
     assert "network.onnx keeps weights in another file, which cannot be read" in shell.err(*command)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_card_in_an_encoding_of_windows(
-    encoding: str, tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell
-) -> None:
-    """Its shell and editors write these, such as for ``edgeperc info pointseg --json > card.json``."""
-    path, card = third_party
-    shell.out(*card_command(tmp_path, path, replace(card, version="2é"), encoding))
-    assert ModelCard.read(tmp_path / "out.onnx").version == "2é"
-
-
-def test_a_card_that_is_no_text_is_named(tmp_path: Path, third_party: tuple[Path, ModelCard], shell: Shell) -> None:
-    command = card_command(tmp_path, *third_party)
+    command = card_command(tmp_path, path, card)
     (tmp_path / "card.json").write_bytes('{"name": "é"}'.encode("latin-1"))
     assert "card.json: 'utf-8' codec can't decode byte 0xe9" in shell.err(*command)
 
@@ -1122,14 +1062,6 @@ def test_weights_have_the_terms_of_their_scans() -> None:
     assert terms_of(["lyft/7", "000001"]) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
     assert terms_of(["pandaset/002_00", "000001"]).startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
     assert terms_of(["mine/1"]) == "mine: terms of that set"
-
-
-def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
-    path, card = third_party
-    write_card(onnx.load(path), card, tmp_path / "one.onnx")
-    write_card(onnx.load(tmp_path / "one.onnx"), replace(card, version="3"), tmp_path / "two.onnx")
-    assert [p.key for p in onnx.load(tmp_path / "two.onnx").metadata_props].count(CARD_KEY) == 1
-    assert Session(tmp_path / "two.onnx", "cpu").card.version == "3"
 
 
 @pytest.mark.usefixtures("small_views")
@@ -1155,7 +1087,7 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     recipe = small(network)
     task = task_of(recipe)
     assert [network in networks for networks in TASKS.values()].count(True) == 1
-    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    samples = samples_of(recipe, simulated)
     image, labels, *boxes = samples.sample(samples.load(0))
     assert image.shape == (len(task.input.channels), task.view.height, task.view.width)
     assert labels.shape == image.shape[1:]

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("torch")
 
 from edgeperc.errors import MissingExtraError
-from edgeperc_export.training.log import TrainingLog, flat
+from edgeperc_export.training.log import TrainingLog, curve_table, flat
 
 LINES: list[dict[str, Any]] = [
     {"step": 100, "loss": 1.5, "validation": {"car": 0.25, "mean": None}},
@@ -44,11 +44,18 @@ def test_a_resumed_run_goes_on_in_its_files(tmp_path: Path) -> None:
     ]
 
 
-def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with TrainingLog(None, tensorboard=True) as log:
-        log.write(LINES[0])
-    assert not [*tmp_path.iterdir()]
+def test_the_curve_of_a_run_is_a_table(tmp_path: Path) -> None:
+    with TrainingLog(tmp_path) as log:
+        for k in range(1, 5):
+            log.write({"step": k, "samples": 8 * k, "loss": 1.0 / k, "validation": {"background": 0.5, "car": 0.1 * k}})
+    with (tmp_path / "log.jsonl").open("a") as file:  # as after a second run, which was killed
+        file.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + '\n{"step": 5, ')
+    head, *rows = curve_table(tmp_path, 2)
+    assert head == f"{tmp_path}: 4 lines of the log, means of 2"
+    means = [["16", "0.7500", "15.0"], ["32", "0.2917", "35.0"]]
+    assert [row.split() for row in rows] == [["samples", "loss", "car"], *means, ["last", "quarter", "+10.0"]]
+    with pytest.raises(ValueError, match="has no line"):
+        list(curve_table(tmp_path / "nothing"))
 
 
 def test_tensorboard_reads_the_same_figures(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from filelock import FileLock, Timeout
-from training_helpers import interrupted_in_step
+from training_helpers import interrupted_in_step, losses_of_steps, train
 
 from cli_helpers import Shell
 from edgeperc.datasets.scan_folder import ScanFolder
@@ -44,8 +44,7 @@ from edgeperc_export.release.object_int8 import candidate_batches, quantize_obje
 from edgeperc_export.release.quantize import Calibration, folded
 from edgeperc_export.release.to_onnx import load, to_graph, verify, with_golden, write_card
 from edgeperc_export.training import object_batches
-from edgeperc_export.training.object_batches import Drawn as Drawn
-from edgeperc_export.training.object_batches import ObjectBatches, ObjectWatch, found_again, tensors
+from edgeperc_export.training.object_batches import Drawn, ObjectBatches, ObjectWatch, found_again, tensors
 from edgeperc_export.training.object_samples import (
     GROUP,
     N_STORED,
@@ -58,7 +57,6 @@ from edgeperc_export.training.object_samples import (
 from edgeperc_export.training.object_sets import variants, write_samples
 from edgeperc_export.training.object_task import Objects, fill_box_ious
 from edgeperc_export.training.start import start
-from edgeperc_export.training.train import Data, Run, train
 
 SEED = 4 * 10**9
 RECIPE = replace(MODELS["objects"].recipe, steps=4, batch=16)
@@ -79,10 +77,10 @@ def scans(labeled: LabeledScan, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="module")
 def samples(labeled: LabeledScan) -> ObjectSamples:
-    perceive = Perceiver(
-        "ssadnet:fp32", mounting=MODEL_MOUNTING, boxes_from="network", agree=False, on_mismatch="ignore"
+    options = {"mounting": MODEL_MOUNTING, "boxes_from": "network", "agree": False, "on_mismatch": "ignore"}
+    return samples_of(
+        labeled, "simulated/0", Perceiver("ssadnet:fp32", **options), np.random.default_rng(0), real=False
     )
-    return samples_of(labeled, "simulated/0", perceive, np.random.default_rng(0), real=False)
 
 
 def test_samples_are_what_the_runtime_sees(labeled: LabeledScan, samples: ObjectSamples) -> None:
@@ -229,16 +227,8 @@ def test_overlap_in_space() -> None:
 
 def test_a_step_lowers_the_loss(samples: ObjectSamples) -> None:
     task = Objects.of(RECIPE)
-    batches, network = ObjectBatches(task, samples, ["simulated"]), build(RECIPE)
-    x, *targets = batches.batch(0)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3)
-    losses = []
-    for _ in range(12):
-        loss = task.loss(network(x), targets)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
+    network, (x, *targets) = build(RECIPE), ObjectBatches(task, samples, ["simulated"]).batch(0)
+    losses = losses_of_steps(network, lambda network: task.loss(network(x), targets), 12, 2e-3)
     assert losses[-1] < 0.8 * losses[0]
     figure, loss, figures = ObjectWatch(task, samples).validate(network.eval())
     assert 0.0 <= figure <= 1.0
@@ -277,12 +267,11 @@ def test_the_graph_looks_closely_where_the_first_look_says_so(tmp_path: Path) ->
 
 
 def test_training_resumes_bit_for_bit(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-
     monkeypatch.setattr(object_batches, "AGAIN", 0.0)  # what random weights find is among the candidates, too
     recipe = replace(RECIPE, found_again=0.5)
 
     def run(name: str) -> dict[str, torch.Tensor]:
-        checkpoint = train(recipe, tmp_path / name, Data(simulated=scans), Run(n_threads=1, checkpoint_every=2))
+        checkpoint = train(recipe, tmp_path / name, simulated=scans, checkpoint_every=2)
         weights: dict[str, torch.Tensor] = load(checkpoint)[0].state_dict()
         return weights
 
@@ -295,10 +284,9 @@ def test_training_resumes_bit_for_bit(scans: Path, tmp_path: Path, monkeypatch: 
 
 def test_two_runs_leave_the_mean_of_their_weights(scans: Path, tmp_path: Path) -> None:
     recipe = replace(RECIPE, steps=2, runs=2, seed=7)
-    data = Data(simulated=scans)
-    mean, of_mean, _ = load(train(recipe, tmp_path / "both", data, Run(n_threads=1)))
+    mean, of_mean, _ = load(train(recipe, tmp_path / "both", simulated=scans))
     one, other = (load(tmp_path / f"both-run-{k}" / "checkpoint.pt")[0].state_dict() for k in range(2))
-    alone = load(train(replace(recipe, runs=1, seed=8), tmp_path / "alone", data, Run(n_threads=1)))[0].state_dict()
+    alone = load(train(replace(recipe, runs=1, seed=8), tmp_path / "alone", simulated=scans))[0].state_dict()
     assert of_mean == recipe
     for name, weight in mean.state_dict().items():
         assert torch.equal(other[name], alone[name])
@@ -325,7 +313,7 @@ def test_without_a_detector_candidates_are_groups(
 ) -> None:
     """The network is exported by the command line, too; what the networks of others found is no part of it."""
     recipe = replace(RECIPE, steps=1, detector=False)
-    checkpoint = train(recipe, tmp_path / "run", Data(simulated=scans), Run(n_threads=1))
+    checkpoint = train(recipe, tmp_path / "run", simulated=scans)
     found = load_samples(tmp_path / "object-samples-of-groups", ["simulated"])
     alone = samples_of(labeled, "simulated/000000", None, np.random.default_rng((0, 0, len("simulated"))), real=False)
     np.testing.assert_array_equal(found.rectangles, alone.rectangles)
@@ -339,8 +327,13 @@ def test_a_missing_source_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no samples of kitti-0"):
         load_samples(tmp_path, ["kitti-0"])
     with pytest.raises(ValueError, match="no scans to train objects on"):
-        train(RECIPE, tmp_path / "run", Data())
+        train(RECIPE, tmp_path / "run")
     build_samples(tmp_path, "nothing", [], real=True)
+    nothing = Calibration([np.zeros((0, 4), np.float32)], [])
+    with pytest.raises(PointsError, match="no candidate in 1 scans"):
+        quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
+    with pytest.raises(ModelError, match="quantize the model in fp32"):
+        quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)
 
 
 def test_samples_are_of_the_scans_and_labels_that_are_there(labeled: LabeledScan, tmp_path: Path) -> None:
@@ -389,14 +382,6 @@ def test_int8_agrees_with_fp32(tmp_path: Path) -> None:
     assert (classes[0] == classes[1]).mean() > 0.95
 
 
-def test_only_fp32_and_scans_with_clusters_are_quantized(tmp_path: Path) -> None:
-    nothing = Calibration([np.zeros((0, 4), np.float32)], [])
-    with pytest.raises(PointsError, match="no candidate in 1 scans"):
-        quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
-    with pytest.raises(ModelError, match="quantize the model in fp32"):
-        quantize_objects(model_path("objects:int8"), tmp_path / "int8.onnx", nothing)
-
-
 def test_the_card_of_int8_has_figures_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The card of the network in fp32 has some, which are not those of int8."""
     faster = np.full(40, 2.0), np.full(40, 1.0)
@@ -432,6 +417,6 @@ def test_runs_on_other_scans_wait_for_one_another(tmp_path: Path, monkeypatch: p
             FileLock(folder / ".lock").acquire(timeout=0)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("edgeperc_export.training.train.write_samples", written)
+    monkeypatch.setattr("edgeperc_export.training.sources.write_samples", written)
     with pytest.raises(KeyboardInterrupt):
-        train(RECIPE, tmp_path / "run", Data())
+        train(RECIPE, tmp_path / "run")
