@@ -50,12 +50,9 @@ def make(
     steps: int | None = None,
     version: str = "1.0.0",
 ) -> Path:
-    """Simulate, train, export and evaluate a model, ``out/NAME.onnx``; finished parts are not made again.
-
-    name : a key of `MODELS`. The models that it starts from or is distilled from are made first.
-    data : the real scans or images. Models whose name ends in ``-sim`` need none; ``kitti`` then serves for evaluation
-        only.
-    layouts, semantickitti : folders of KITTI's labels and calibrations alone, and of SemanticKITTI.
+    """Simulate, train, export and evaluate a model of `MODELS`, ``out/NAME.onnx``, after those that it starts from or
+    is distilled from; finished parts are not made again. Open models, and those whose name ends in ``-sim``, take
+    ``data.kitti`` for evaluation only; ``layouts`` holds KITTI's labels and calibrations alone.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)

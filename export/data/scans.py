@@ -109,8 +109,7 @@ class LabeledScan:
         return self.labeled(geometry) & self.boxes_known
 
     def top_view_truth(self, geometry: TopViewGeometry) -> Bytes:
-        """SSADNet's segmentation truth (3.1.2), (rows, cols) uint8: the surface with the vehicles drawn over it.
-
+        """SSADNet's segmentation truth (3.1.2), (rows, cols) uint8: the surface with the vehicles drawn over it;
         `IGNORE` where it is unknown.
         """
         x, y = geometry.cell_centers()

@@ -37,14 +37,9 @@ def simulate(
     where: str = "street",
     n_workers: int = 0,
 ) -> None:
-    """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes; ValueError if they are
-    of another sensor or place, or with layouts and now without, or the other way round.
-
-    first : number and seed of the first scan.
-    layouts_root : folder of KITTI's labels; every other street gets the boxes of one of its scans.
-    sensor : name of the sensor to simulate.
-    where : kind of place, one of `edgeperc.types.choices.PLACES`; only streets have layouts, ValueError otherwise.
-    n_workers : number of processes that simulate; 0: this one. The scans are the same.
+    """Write ``n`` labeled scans, of seeds from ``first``, into ``out``; of streets, every other one has the boxes of a
+    scan of KITTI's ``layouts_root``. Existing files are kept, so a stopped run resumes; ValueError if they are of
+    another sensor or place, or with layouts and now without. The scans are the same for any ``n_workers``.
     """
     if layouts_root is not None and where != "street":
         raise ValueError(f"layouts are those of streets, and the place is a {where}; leave them out")
@@ -111,10 +106,7 @@ def parity_samples(task: str, paths: Sequence[Path] = ()) -> list[NDArray[Any]]:
 
 
 def fitness_of(kitti: Path | None) -> FitnessProfile:
-    """The fitness profile of the training scans: KITTI's, or, if ``kitti`` is None, 32 simulated ones.
-
-    At runtime, inputs are compared with it.
-    """
+    """What inputs are compared with at runtime: the profile of KITTI's training scans, or of 32 simulated ones."""
     if kitti is None:
         return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
     objects = KittiObjects(kitti)

@@ -60,15 +60,13 @@ def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) ->
 def dense_targets(
     boxes: ArrayLike, view: TopViewGeometry, *, labeled: Mask | None = None, unsure: ArrayLike = ()
 ) -> Floats32:
-    """Heat map and geometry for head "dense".
+    """Heat map and geometry for head "dense", (11, height/4, width/4), of boxes (m, 7): center, sizes [m], yaw [rad].
+    Cells near ``unsure`` ones, such as those without returns, and those that are not ``labeled`` are not learned.
 
-    boxes, unsure : (m, 7) x, y, z of the center, length, width, height [m], yaw [rad]; unsure ones, such as those
-        without returns, count neither as found nor as missed: cells near them are not learned.
-    labeled : False in cells where boxes are not labeled, such as outside the camera's view.
-    Returns (11, height/4, width/4): Channel 0, the heat: 1 in the output cell that holds a box's center; around it a
-        Gaussian shaped like the box, whose edges are three standard deviations away; -1 in cells that are not learned.
-        Channels 1 to 8: the geometry of the box with the highest heat, in the format of box_dense, where that heat is
-        at least `REGRESSED_FROM`; else 0. Channels 9 and 10: x and y of the unit vector towards its front.
+    Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box, whose
+    edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry of the box
+    with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else 0. Channels 9
+    and 10: x and y of the unit vector towards its front.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
     target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)

@@ -35,10 +35,7 @@ LARGE: dict[str, Callable[..., nn.Module]] = {
 
 
 def build(recipe: Recipe) -> nn.Module:
-    """The network of a recipe, with initial weights drawn from the recipe's seed.
-
-    Raises ValueError.
-    """
+    """The network of a recipe, with initial weights drawn from the recipe's seed. Raises ValueError."""
     card = card_of(recipe, version="0")
     sizes: dict[str, Any] = {"n_channels": len(card.input.channels), "n_classes": len(card.classes)}
     if recipe.network == "ssadnet":

@@ -27,9 +27,8 @@ REACH = 7
 
 
 class ContextAggregation(nn.Module):
-    """Scale each channel of each pixel by its surroundings, which reduces the effect of missing returns.
-
-    The maximum of 7x7 pixels is squeezed to a sixteenth of the channels and expanded again; its sigmoid is the scale.
+    """Scale each channel of each pixel by its surroundings, which reduces the effect of missing returns: the maximum of
+    7x7 pixels is squeezed to a sixteenth of the channels and expanded again; its sigmoid is the scale.
     """
 
     def __init__(self, channels: int) -> None:

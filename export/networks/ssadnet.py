@@ -126,9 +126,8 @@ class SegmentationBranch(nn.Module):
 
 
 class FeatureBlock(nn.Module):
-    """F.E. block: two 3x3 convolutions with batch norm and ELU, then 2x2 max-pooling (Figure 6a).
-
-    ``extra`` adds a third convolution after the pooling.
+    """F.E. block: two 3x3 convolutions with batch norm and ELU, then 2x2 max-pooling (Figure 6a); ``extra`` adds a
+    third convolution after the pooling.
     """
 
     def __init__(self, c_in: int, c_out: int, extra: bool) -> None:
@@ -141,9 +140,8 @@ class FeatureBlock(nn.Module):
 
 
 class BoxRegressor(nn.Module):
-    """B.B.R. block: one number for each slot (Figure 6b).
-
-    With ``n_slots``, each is an average over the image; with None, each feature of the image has a slot.
+    """B.B.R. block: one number for each slot (Figure 6b), an average over the image; without ``n_slots``, each feature
+    of the image has a slot.
     """
 
     def __init__(self, channels: int, n_slots: int | None, dropout: float) -> None:
