@@ -144,12 +144,17 @@ def test_dropout_is_where_the_docstrings_say(network: Any, expected: list[tuple[
 @pytest.mark.parametrize("network", [UNet(width=2), UNet(width=2, n_levels=7), SegNet(), CamSeg()])
 def test_logits_have_the_size_of_the_image(network: nn.Module) -> None:
     """Also of images whose sides no pooling divides; camseg's have a quarter of it."""
-    for height, width in ((36, 48), (45, 58)):
-        if isinstance(network, CamSeg):
-            height, width = height // 4 * 4, width // 4 * 4
-        logits = network.eval()(torch.zeros(1, 3, height, width))
-        stride = 4 if isinstance(network, CamSeg) else 1
-        assert logits.shape == (1, 11, height // stride, width // stride)
+    stride = 4 if isinstance(network, CamSeg) else 1
+    for height, width in ((36 // stride, 48 // stride), (45 // stride, 58 // stride)):
+        logits = network.eval()(torch.zeros(1, 3, stride * height, stride * width))
+        assert logits.shape == (1, 11, height, width)
+
+
+def test_early_logits_are_of_training_alone() -> None:
+    network = CamSeg(deep_supervision=True)
+    shapes = [tuple(each.shape[1:]) for each in network(torch.zeros(2, 3, 32, 48))]
+    assert shapes == [(11, 8, 12), (11, 4, 6), (11, 2, 3)]
+    assert network.eval()(torch.zeros(1, 3, 32, 48)).shape == (1, 11, 8, 12)
 
 
 def test_unpooling_puts_values_back_where_they_were_the_maximum() -> None:
@@ -187,14 +192,7 @@ def test_camseg_is_small_enough() -> None:
     assert not any(module.in_channels % 16 for module in dilated)
 
 
-def test_early_logits_are_of_training_alone() -> None:
-    network = CamSeg(deep_supervision=True)
-    shapes = [tuple(each.shape[1:]) for each in network(torch.zeros(2, 3, 32, 48))]
-    assert shapes == [(11, 8, 12), (11, 4, 6), (11, 2, 3)]
-    assert network.eval()(torch.zeros(1, 3, 32, 48)).shape == (1, 11, 8, 12)
-
-
-def test_unlabeled_pixels_are_ignored(drawn: Path) -> None:
+def test_unlabeled_pixels_are_ignored_and_other_classes_refused(drawn: Path, tmp_path: Path) -> None:
     images = read_camvid(drawn, "train")
     assert images.images.shape == (6, 3, 72, 96)
     assert set(images.labels.unique().tolist()) == {0, 1, 3, 4, 8, IGNORE}
@@ -202,9 +200,6 @@ def test_unlabeled_pixels_are_ignored(drawn: Path) -> None:
     half = images.scaled(48, 36)
     assert half.images.shape == (6, 3, 36, 48)
     assert set(half.labels.unique().tolist()) <= {0, 1, 3, 4, 8, IGNORE}
-
-
-def test_other_classes_are_refused(drawn: Path, tmp_path: Path) -> None:
     (tmp_path / "classes.json").write_text(json.dumps({"0": "road", "1": "void"}))
     with pytest.raises(ImageError, match="expected"):
         read_camvid(tmp_path, "train")
@@ -311,17 +306,13 @@ def test_lovasz_of_all_classes_at_once_is_the_same() -> None:
 
 def test_figures_follow_the_papers_equations() -> None:
     # Class 0: 5 right, 1 missed, 2 false. Class 1: 2 right, 2 missed, 1 false. Class 2 does not occur.
-    counts = np.array([[5, 1, 0], [2, 2, 0], [0, 0, 0]])
-    found = camvid.figures_of(counts)
+    found = camvid.figures_of(np.array([[5, 1, 0], [2, 2, 0], [0, 0, 0]]))
     assert found["miou"] == pytest.approx((5 / 8 + 2 / 5) / 2)  # equation 1
     assert found["accuracy"] == pytest.approx(7 / 10)  # equation 2
     f1 = [2 * (5 / 7 * 5 / 6) / (5 / 7 + 5 / 6), 2 * (2 / 3 * 2 / 4) / (2 / 3 + 2 / 4)]  # equations 3 to 5
     assert found["f1"] == pytest.approx(sum(f1) / 2)
     assert found["dice"] == pytest.approx(2 * 7 / (10 + 10))  # equation 6
-
-
-def test_a_class_that_is_never_found_counts_as_zero() -> None:
-    found = camvid.figures_of(np.array([[5, 0], [3, 0]]))
+    found = camvid.figures_of(np.array([[5, 0], [3, 0]]))  # a class that is never found counts as 0
     assert found["miou"] == pytest.approx((5 / 8) / 2)
     assert found["f1"] == pytest.approx((2 * 5 / 8 * 1 / (5 / 8 + 1)) / 2)
 
@@ -347,8 +338,7 @@ def test_confusions_count_each_image(drawn: Path) -> None:
 def test_one_step_of_each_network(network: str, drawn: Path, tmp_path: Path) -> None:
     recipe = replace(Recipe(network), **{**SMALL, "steps": 1})
     start = build(recipe)
-    checkpoint = train(recipe, tmp_path, kitti=None, simulated=None, camvid=drawn, n_threads=1)
-    state = read_checkpoint(checkpoint)
+    state = read_checkpoint(train(recipe, tmp_path, camvid=drawn))
     assert [*state["frames"]] == [f"{k:03}" for k in range(6)]
     (line,) = (json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines())
     assert line["validation"].keys() == {"mean", *CAMERA_CLASSES}
@@ -358,23 +348,21 @@ def test_one_step_of_each_network(network: str, drawn: Path, tmp_path: Path) -> 
 
 def test_a_resumed_run_ends_with_the_same_weights(drawn: Path, tmp_path: Path) -> None:
     recipe = replace(Recipe("camseg"), **{**SMALL, "deep_supervision": 0.4, "dropout": 0.1})
-    given: dict[str, Any] = {"kitti": None, "simulated": None, "camvid": drawn, "n_threads": 1, "checkpoint_every": 2}
-    whole = read_checkpoint(train(recipe, tmp_path / "whole", **given))
+    whole = read_checkpoint(train(recipe, tmp_path / "whole", camvid=drawn, checkpoint_every=2))
     with interrupted_in_step(4, Camera):
-        train(recipe, tmp_path / "parts", **given)
-    parts = read_checkpoint(train(recipe, tmp_path / "parts", **given))
+        train(recipe, tmp_path / "parts", camvid=drawn, checkpoint_every=2)
+    parts = read_checkpoint(train(recipe, tmp_path / "parts", camvid=drawn, checkpoint_every=2))
     assert all(torch.equal(whole["averaged"][name], parts["averaged"][name]) for name in whole["averaged"])
 
 
 def test_accumulated_gradients_are_those_of_the_batch(drawn: Path, tmp_path: Path) -> None:
     """Of a network without batch norm. One step of Adam is as long as the rate for any gradient, so its sign counts."""
-    given: dict[str, Any] = {"kitti": None, "simulated": None, "camvid": drawn, "n_threads": 1}
-    recipe = replace(PAPER["unet-small"], **{**SMALL, "batch": 4, "steps": 1, "stop_after": 0, "accumulate": 1})
-    moments = [
-        read_checkpoint(train(replace(recipe, accumulate=n), tmp_path / str(n), **given))["optimizer"]["state"]
-        for n in (1, 4)
-    ]
-    one, other = (torch.cat([each["exp_avg"].flatten() for each in found.values()]) for found in moments)
+    recipe = replace(PAPER["unet-small"], **{**SMALL, "batch": 4, "steps": 1, "stop_after": 0})
+    moments = []
+    for n in (1, 4):
+        state = read_checkpoint(train(replace(recipe, accumulate=n), tmp_path / str(n), camvid=drawn))
+        moments.append(torch.cat([each["exp_avg"].flatten() for each in state["optimizer"]["state"].values()]))
+    one, other = moments
     assert float(torch.linalg.norm(one - other) / torch.linalg.norm(one)) < 0.05  # of bf16
 
 
@@ -391,16 +379,12 @@ def test_training_stops_without_a_better_validation() -> None:
 
 
 def test_the_papers_protocol_keeps_the_best_epoch(drawn: Path, tmp_path: Path) -> None:
-    recipe = replace(PAPER["unet-small"], image_width=48, image_height=36, batch=2, accumulate=2, steps=9)
-    recipe = replace(recipe, learning_rate=1e-3)
-    state = read_checkpoint(train(recipe, tmp_path, kitti=None, simulated=None, camvid=drawn, n_threads=1))
+    sizes = {"image_width": 48, "image_height": 36, "batch": 2, "accumulate": 2, "steps": 9, "learning_rate": 1e-3}
+    state = read_checkpoint(train(replace(PAPER["unet-small"], **sizes), tmp_path, camvid=drawn))
     assert [row["step"] for row in state["curve"]] == [3, 6, 9]  # an epoch is three steps
     assert state["best"] is not None
-
-
-def test_images_are_needed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="give --camvid"):
-        train(Recipe("camseg"), tmp_path, kitti=None, simulated=None)
+        train(Recipe("camseg"), tmp_path / "none")
 
 
 def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> None:
@@ -438,7 +422,7 @@ def trained(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """A checkpoint of camseg and its exported model, of images of 64 x 48."""
     folder = tmp_path_factory.mktemp("camseg")
     recipe = replace(Recipe("camseg"), **{**SMALL, "image_width": 64, "image_height": 48, "steps": 30, "ema": 0.5})
-    checkpoint = train(recipe, folder, kitti=None, simulated=None, camvid=drawn, n_threads=1)
+    checkpoint = train(recipe, folder, camvid=drawn)
     export(checkpoint, folder / "camseg.onnx", scans=parity_samples("camera"), fitness=None)
     return checkpoint, folder / "camseg.onnx"
 
@@ -490,24 +474,18 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     def race(one: Path, other: Path, n_threads: int | None) -> Any:
         return np.linspace(2.0, 2.1, 40), np.linspace(1.0, 1.1, 40)
 
-    card = quantize(
-        trained[1],
-        tmp_path / "int8.onnx",
-        Calibration(images, hashes),
-        LabeledSets(camvid=drawn),
-        race=race,
-        max_noise=9.0,
-    )
+    out, given = tmp_path / "int8.onnx", (Calibration(images, hashes), LabeledSets(camvid=drawn))
+    card = quantize(trained[1], out, *given, race=race, max_noise=9.0)
     assert card.precision == "int8"
     assert card.training["quantized"]["calibration"] == "6 images of CamVid"
     assert card.metrics["images"]["n_images"] == 3
     # The record that "auto" decides by, with OpenVINO in bf16 too if it is installed and the processor has bf16.
-    records = agree([trained[1], tmp_path / "int8.onnx"], kitti=None, camvid=drawn)
+    records = agree([trained[1], out], kitti=None, camvid=drawn)
     assert records.keys() >= {"fp32", "int8"}
     assert records["int8"]["n_scans"] == 3
     assert records["fp32"]["label_agreement"] == 1.0
     assert records["int8"]["command"] == "edgeperc-export agree camseg --camvid CAMVID --split validation"
-    assert ModelCard.read(tmp_path / "int8.onnx").precisions["int8"] == records["int8"]
+    assert ModelCard.read(out).precisions["int8"] == records["int8"]
     with pytest.raises(PointsError, match="is of a camera"):
         agree([trained[1]], kitti=drawn)
 
