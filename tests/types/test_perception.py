@@ -65,16 +65,13 @@ def test_a_box_is_read_back_as_it_was_written() -> None:
     ],
 )
 def test_a_wrong_box_is_refused(change: dict[str, Any], message: str) -> None:
+    document = CAR.to_dict() | change
     with pytest.raises(PointsError, match=message):
-        Box.from_dict(CAR.to_dict() | change)
-
-
-@pytest.mark.parametrize("key", ["label", "score", "center", "size", "yaw"])
-def test_a_box_without_a_key_is_refused(key: str) -> None:
-    document = CAR.to_dict()
-    del document[key]
-    with pytest.raises(PointsError, match=key):
         Box.from_dict(document)
+    for key in {*change} - {"front"}:  # which alone may be missing
+        del document[key]
+        with pytest.raises(PointsError, match=key):
+            Box.from_dict(document)
 
 
 @given(
