@@ -131,18 +131,14 @@ def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
     found = voting.Tallies(np.empty(6, voting.CLUSTER), np.empty((6, 5), np.int32))
     cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
-    args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
-    grid = Grid(16.0, 8.0, 0.4)
-    voting.fill_tallies(scene.cloud, *args[2:5], voting.Cells(*args[5:], grid), found)
-    counts, bounds, above = twins.rules.tallies(*args, grid, 6, 4)
+    view = voting.Cells(cells, np.arange(256) % 5 > 1, Grid(16.0, 8.0, 0.4))
+    args = scene.cloud, scene.in_view, scene.labels, scene.clusters, view
+    voting.fill_tallies(*args, found)
+    counts, bounds, above = twins.rules.tallies(*args, 6, 4)
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(structured_to_unstructured(found.clusters[BOUNDS]), bounds)
     held = found.clusters[["n_in_both", "n_in_vehicles", "n_points"]]
     np.testing.assert_array_equal(structured_to_unstructured(held), above)
-
-
-def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
-    return [read_only(array, array.dtype) for array in arrays]
 
 
 @settings(max_examples=60)
@@ -152,14 +148,14 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     support = Support(np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8))
     among, labeled = scene.in_view & ~scene.on_ground, Labeled(scene.labels, ROLES)
     fill_support(scene.cloud, among, labeled, records, support)
-    for own, right in zip(support, twins.rules.support(*scene.cloud, ~among, *labeled, records), strict=True):
+    for own, right in zip(support, twins.rules.support(scene.cloud, ~among, labeled, records), strict=True):
         np.testing.assert_array_equal(own, right)
     counts, sums = np.empty((len(boxes), 3), np.int64), np.empty((len(boxes), 3))
     masks = scene.on_ground, scene.in_view
     count_inside(scene.cloud, *masks, labeled, records, counts)
-    np.testing.assert_array_equal(counts, twins.rules.inside_counts(*scene.cloud, *masks, *labeled, records))
+    np.testing.assert_array_equal(counts, twins.rules.inside_counts(scene.cloud, *masks, labeled, records))
     sum_inside(scene.cloud, *masks, labeled, records, sums)
-    np.testing.assert_array_equal(sums, twins.rules.inside_sums(*scene.cloud, *masks, *labeled, records))
+    np.testing.assert_array_equal(sums, twins.rules.inside_sums(scene.cloud, *masks, labeled, records))
 
 
 @settings(max_examples=60)
@@ -169,14 +165,12 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     n = len(scene.points)
     table = rng.integers(0, 4, (6, 4)).astype(np.uint8)
     scores, names = rng.random(n).astype(np.float32), rng.integers(0, 4, n).astype(np.uint8)
-    in_view, clusters = scene.in_view, scene.clusters
-    found = scene.labels.copy()
+    in_view, clusters, labeled = scene.in_view, scene.clusters, Labeled(scene.labels, ROLES)
+    found, votes = scene.labels.copy(), np.empty(n, np.uint8)
     voting.apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
-    right = twins.rules.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
-    np.testing.assert_array_equal(found, right)
-    votes = np.empty(n, np.uint8)
-    voting.fill_votes(scene.in_view, Labeled(scene.labels, ROLES), scores, votes)
-    np.testing.assert_array_equal(votes, twins.rules.votes(scene.in_view, scene.labels, ROLES, scores))
+    np.testing.assert_array_equal(found, twins.rules.verdicts(in_view, clusters, table, (scores, names), labeled))
+    voting.fill_votes(in_view, labeled, scores, votes)
+    np.testing.assert_array_equal(votes, twins.rules.votes(in_view, labeled, scores))
 
 
 @settings(max_examples=60)
@@ -197,7 +191,7 @@ def test_what_becomes_of_clusters_matches_the_twin(
         clusters[name] = column
     sight = voting.Sight(*rng.choice([(0.3, 0.035), (0.5, -0.1), (1.73, 0.2), (math.inf, 0.0)]).tolist())
     voting.fill_verdicts(voting.Tallies(clusters, counts), refused, ROLES, parts, voting.Applied(*rules), sight, found)
-    right = twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules, *sight)
+    right = twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, rules, sight)
     np.testing.assert_array_equal(found, right)
 
 
@@ -264,9 +258,9 @@ def test_a_forest_is_not_searched_because_of_a_few_labels() -> None:
 def test_cleared_ground_matches_the_twin(given: list) -> None:
     scene = Scene([(round(x) if abs(x) < 99 else x, 0.1, *rest) for x, _, *rest in given])  # many in one cell
     found = scene.labels.copy()
-    arrays = map_read_only((scene.points, scene.height, scene.on_ground))
-    clear_ground(*arrays, ROLES, found)
-    np.testing.assert_array_equal(found, twins.rules.ground(*arrays, ROLES, scene.labels))
+    on_ground = read_only(scene.on_ground, np.bool_)
+    clear_ground(*scene.cloud, on_ground, ROLES, found)
+    np.testing.assert_array_equal(found, twins.rules.ground(scene.cloud, on_ground, Labeled(scene.labels, ROLES)))
 
 
 @settings(max_examples=60)
@@ -277,11 +271,10 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     is_vehicle = (np.arange(256) > 1) & of_vehicles
     in_box = np.random.default_rng(len(given)).random(cells.shape) < 0.3
     drivable, marks = 1 if of_road else 255, np.zeros(cells.shape, np.uint8)
-    labeled = Labeled(scene.labels, ROLES)
-    fill_marks(scene.cloud, scene.in_view, labeled, by_height, voting.Cells(cells, is_vehicle, grid), marks)
+    args = scene.cloud, scene.in_view, Labeled(scene.labels, ROLES), by_height, voting.Cells(cells, is_vehicle, grid)
+    fill_marks(*args, marks)
     clear_cells(marks, np.flatnonzero(marks), drivable, is_vehicle, in_box, found)
-    args = *scene.cloud, scene.in_view, *labeled, by_height, grid, drivable, is_vehicle, in_box, cells
-    np.testing.assert_array_equal(found, twins.rules.cells(*args))
+    np.testing.assert_array_equal(found, twins.rules.cells(*args, drivable, in_box))
 
 
 @settings(max_examples=60)
@@ -296,7 +289,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
     assert not agreed.labels[~scene.in_view].any()
     boxed = np.zeros(len(scene.points), np.bool_)
     for box in boxes:
-        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, as_rows([box])[0])
+        own = twins.rules.inside(scene.cloud, scene.on_ground, as_rows([box])[0])
         boxed |= own & (box.score >= 0.3)
     for k in range(6):
         own = scene.clusters == k
@@ -341,7 +334,7 @@ def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: lis
     kept = agree_on_boxes(boxes, Scan.of(scene.points, scene.ground), scene.found)
     assert [box for box in boxes if box in kept] == [*kept]
     for box in boxes:
-        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, as_rows([box])[0])
+        own = twins.rules.inside(scene.cloud, scene.on_ground, as_rows([box])[0])
         is_right = np.count_nonzero(own & (scene.labels == 1)) >= 0.1 * np.count_nonzero(own & scene.in_view)
         assert (box in kept) == (box.score >= 0.5 or (own.any() and (is_right or not (own & scene.in_view).any())))
 
@@ -388,6 +381,14 @@ def block(
     return np.array(rows)
 
 
+def scan_of(rows: NDArray[np.float64], *, ground_m: float = GROUND_Z) -> tuple[Scan, PointLabels]:
+    """A scan of rows x, y, height, label, none of them on the ground, which lies ``ground_m`` high, and its labels."""
+    points = np.column_stack([rows[:, :2], rows[:, 2] + ground_m, np.zeros(len(rows))]).astype(np.float32)
+    labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
+    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    return Scan.of(points, ground, labels), labels
+
+
 def agreed_scene(
     *parts: NDArray[np.float64],
     boxes: tuple[Box, ...] = (),
@@ -398,9 +399,8 @@ def agreed_scene(
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))
     rows = np.concatenate([np.column_stack([x, y, np.zeros((x.size, 2))]), *parts])
-    points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
-    labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
-    ground = find_ground(points)
+    scan, labels = scan_of(rows)
+    points, ground = scan.points, find_ground(scan.points)
     clusters = voters_of(points, labels, ground, boxes, rules)
     return rows, agreed_points(points, labels, ground, clusters, boxes, view=view, sight=sight, rules=rules).labels
 
@@ -484,9 +484,8 @@ def test_person_at_a_hedge_stays(yaw: float) -> None:
 def test_person_at_a_hedge_has_a_box() -> None:
     hedge, person = block(12.0, 4.0, (14.0, 0.4, 1.6), 0, 0.1), block(10.0, 3.5, (0.5, 0.4, 1.7), 2, 0.1)
     rows = np.concatenate([hedge, person])
-    points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
-    labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
-    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    scan, labels = scan_of(rows)
+    points, ground = scan.points, scan.ground
     complete = find_clusters(points, seeds=labels.labels > 0, min_points=1)
     for clusters in (voters_of(points, labels, ground), complete):
         agreed = agreed_points(points, labels, ground, clusters)
@@ -588,37 +587,28 @@ def test_vehicles_stand_on_the_ground_below_them(label: str, tall: float, least:
     sides = block(12.0, 3.0, (4.0, 1.7, tall + 0.01), 1)
     tree = block(12.0, 3.0, (3.0, 1.0, 4.0), 0)
     rows = np.concatenate([sides, tree[tree[:, 2] > 3.0]])
-    points = np.column_stack([rows[:, :2], rows[:, 2] - 2.3, np.zeros(len(rows))]).astype(np.float32)
-    # Below this car, the street is 0.57 m lower than around the sensor.
-    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    scan, found = scan_of(rows, ground_m=-2.3)  # the street is 0.57 m lower than around the sensor
     own, empty = (Box(label, 0.6, (x, 3.0, -0.9), (4.1, 1.8, 1.5), 0.1) for x in (12.0, 30.0))
     person = Box("pedestrian", 0.6, (12.0, 3.0, -0.9), (1.0, 1.0, 1.7), 0.0)
-    standing, *others = stand_boxes([own, empty, person], Scan.of(points, ground), None)
+    standing, *others = stand_boxes([own, empty, person], scan, None)
     assert others == [empty, person]
     top = rows[rows[:, 2] < 2.5, 2].max()
     assert standing.size == pytest.approx((4.1, 1.8, max(top, least)), abs=1e-6)
     assert standing.center == pytest.approx((12.0, 3.0, -2.3 + 0.03 + standing.size[2] / 2), abs=1e-6)
     assert replace(standing, center=own.center, size=own.size) == own
-    seen, unseen = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
-    scan = Scan.of(points, ground)
-    for labels in (
-        PointLabels(rows[:, 3].astype(np.uint8), seen, CLASSES),
-        PointLabels(unseen.view(np.uint8), unseen, CLASSES),
-    ):
+    unseen = np.zeros(len(rows), np.bool_)
+    for labels in (found, PointLabels(unseen.view(np.uint8), unseen, CLASSES)):
         assert stand_boxes([own], scan, labels) == (standing,)
-    background = PointLabels(unseen.view(np.uint8), seen, CLASSES)
-    assert stand_boxes([own], scan, background) == (own,)
+    assert stand_boxes([own], scan, replace(found, labels=unseen.view(np.uint8))) == (own,)
     assert stand_boxes([own], scan, None, RULES - {"stand"}) == (own,)
-    assert stand_boxes([own], Scan.of(points, replace(ground, plane=None)), None) == (own,)
+    assert stand_boxes([own], Scan.of(scan.points, replace(scan.ground, plane=None)), None) == (own,)
 
 
 @pytest.mark.parametrize("away", [2.0, 10.0, 20.0, 40.0])
 def test_a_far_box_keeps_its_height_where_the_next_return_may_be_missing(away: float) -> None:
     sides = block(away, 0.0, (4.0, 1.7, 1.4), 1)
-    points = np.column_stack([sides[:, :2], sides[:, 2] + GROUND_Z, np.zeros(len(sides))]).astype(np.float32)
-    ground = Ground(np.zeros(len(sides), np.bool_), sides[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
     box = Box("car", 0.6, (away, 0.0, -0.9), (4.1, 1.8, 1.6), 0.0)
-    (standing,) = stand_boxes([box], Scan.of(points, ground), None)
+    (standing,) = stand_boxes([box], scan_of(sides)[0], None)
     most = sides[:, 2].max() + 0.015 * away
     assert standing.size[2] == pytest.approx(min(max(most, 1.4), 1.6), abs=1e-6)
     assert (standing.size[2] == 1.6) == (away > 30.0)

@@ -268,7 +268,7 @@ def test_groups_agree_with_the_twin(seed: int, n_people: int) -> None:
     groups, loose = Groups(np.empty_like(order), np.empty_like(starts)), np.empty_like(order)
     labeled = Labeled(labels, ROLES)
     n, n_loose = persons.fill_person_groups(Cloud(points, height), labeled, Groups(order, starts), groups, loose)
-    whole, others = twins.persons.groups(points, height, labels, ROLES, clusters)
+    whole, others = twins.persons.groups(Cloud(points, height), labeled, clusters)
     found = [groups.order[groups.starts[k] : groups.starts[k + 1]].tolist() for k in range(n)]
     assert found == [members.tolist() for members in whole]
     assert loose[:n_loose].tolist() == others
@@ -287,7 +287,7 @@ def test_persons_agree_with_the_twin(seed: int, n_people: int, min_points: int) 
     records, scan = np.empty(len(points), persons.PERSON), (Cloud(points, height), Labeled(labels, ROLES))
     n = persons.fill_persons(*scan, whole, n_whole, clusters, Groups(order, starts), min_points, records)
     found = structured_to_unstructured(records)
-    expected = twins.persons.rows(points, height, labels, ROLES, groups, n_whole, clusters, min_points)
+    expected = twins.persons.rows(*scan, groups, n_whole, clusters, min_points)
     assert n == len(expected)
     assert sorted(given_order.tolist()) == sorted(order.tolist())
     np.testing.assert_allclose(found[:n, :5], expected[:, :5], atol=1e-6)
@@ -304,7 +304,7 @@ def test_completed_persons_agree_with_the_twin(seed: int, n_people: int) -> None
     n = clusters.max(initial=-1) + 1
     tallies, cloud = Tallies(np.empty(n, CLUSTER), np.empty((n, 5), np.int32)), Cloud(points, height)
     fill_tallies(cloud, in_view, labels, clusters, cells_of(None), tallies)
-    expected = twins.persons.completed(points, height, in_view, clusters, 2, 3, labels)
+    expected = twins.persons.completed(cloud, in_view, clusters, 2, 3, labels)
     persons.complete_persons(cloud, in_view, clusters, may_be_persons(tallies, 2, 3), 2, 3, labels)
     np.testing.assert_array_equal(labels, expected)
 
@@ -318,12 +318,12 @@ def test_the_parts_of_the_kernel_agree_with_their_twins(n: int) -> None:
     for above in (-math.inf, 1.0, 99.0):
         cloud = Cloud(points, height)
         found = persons.measure(cloud, members, above)
-        np.testing.assert_allclose(found, twins.persons.measured(points, height, members, above), atol=1e-6)
+        np.testing.assert_allclose(found, twins.persons.measured(cloud, members, above), atol=1e-6)
         if n:
             own = persons.border_of(cloud, members, above, found)
-            assert own == pytest.approx(twins.persons.border(points, height, members, above, found))
+            assert own == pytest.approx(twins.persons.border(cloud, members, above, found))
             own = persons.head_width(cloud, members, found)
-            assert own == pytest.approx(twins.persons.heads(points, height, members, found))
+            assert own == pytest.approx(twins.persons.heads(cloud, members, found))
 
 
 def test_hostile_groups_are_bounded() -> None:

@@ -121,7 +121,7 @@ def test_cast_is_its_twin(seed: int, tilt: float, clumped: bool) -> None:
     pose = sensor_pose(scene, SMALL, 1.0, 0.3, yaw=0.2, pitch=tilt, roll=-tilt)
     rays = Rays(elevations[:, None], azimuths, 40.0, KEY, clumped)
     placed, (ranges, hits, exits, cosines) = cast(scene, pose, rays)
-    slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
+    slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, rays)
     # Where a ray all but grazes the ground, a kerb between two samples may be missed too.
     grazing = ((hits == -1) & (ranges > 18.0)) | ((slow_hits == -1) & (slow_ranges > 18.0))
     close = (hits != slow_hits) & (np.abs(ranges - slow_ranges) < 0.02)  # within a step of the twin's walk
@@ -155,7 +155,7 @@ def test_cast_without_shapes_and_with_shapes_that_are_not_finite() -> None:
         azimuths = np.arange(n_columns) * 2 * np.pi / n_columns
         rays = Rays(np.array(beams)[:, None], azimuths, 40.0, KEY)
         placed, found = cast(empty, pose, rays)
-        slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, *rays)
+        slow_ranges, slow_hits = twins.simulation.cast(placed, empty, pose, rays)
         np.testing.assert_array_equal(found[1], slow_hits)
         np.testing.assert_allclose(found[0], slow_ranges, rtol=0, atol=0.02)
         assert set(found[1].ravel()) <= {-1, -2}
@@ -734,7 +734,7 @@ def test_rays_of_their_own_elevations_are_cast_as_by_the_twins(seed: int, n: int
     rays = Rays(rng.uniform(-0.4, 0.2, (1, n)), np.sort(rng.uniform(0.0, 2 * np.pi, n)), 40.0, KEY)
     for n_sectors in (1, 36):
         placed, hits = cast(scene, pose, rays, n_sectors)
-        slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, *rays)
+        slow_ranges, slow_hits = twins.simulation.cast(placed, scene, pose, rays)
         sure = (slow_ranges < 18.0) & (np.abs(hits.ranges - slow_ranges) < 0.5)
         np.testing.assert_array_equal(hits.rows[sure], slow_hits[sure])
         np.testing.assert_allclose(hits.ranges[sure], slow_ranges[sure], rtol=0, atol=0.03)

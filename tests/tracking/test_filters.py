@@ -262,13 +262,17 @@ def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
     groups, theirs = rng.integers(0, 2, n), rng.integers(0, 2, m)
     sigmas, prior, odds = np.tile(SIGMAS, (n, 1)), rng.dirichlet(np.ones(3), n), rng.uniform(1.0, 9.0, n)
     limits, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
-    tracks, gates = jpda.Predictions(means, predicted, prior), jpda.Gates(sigmas, odds, groups, limits)
-    jpda.fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
-    wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, limits)
+    given = (
+        jpda.Predictions(means, predicted, prior),
+        jpda.Gates(sigmas, odds, groups, limits),
+        detected(detections, theirs),
+    )
+    jpda.fill_likelihoods(*given, got, weights)
+    wanted = twins.tracking.likelihoods(*given)
     np.testing.assert_allclose(got, wanted, atol=1e-12)
     np.testing.assert_allclose(weights, odds[:, None] * np.einsum("nk,nkm->nm", prior, wanted), atol=1e-12)
     detections[:1] = np.nan  # the tracker never lets it in; it must not spread either way
-    jpda.fill_likelihoods(tracks, gates, detected(detections, theirs), got, weights)
+    jpda.fill_likelihoods(*given, got, weights)
     assert not got[:, :, :1].any()
 
 

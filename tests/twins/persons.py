@@ -9,52 +9,50 @@ import numpy as np
 from edgeperc.objects import persons
 
 
-def measured(points: np.ndarray, height: np.ndarray, members: np.ndarray, above: float) -> np.ndarray:
+def measured(cloud: Any, members: np.ndarray, above: float) -> np.ndarray:
     """Twin of `persons.measure`: the axis is the mean direction of squared offsets, as complex numbers."""
-    tall = height[members].astype(np.float64)
+    tall = cloud.height[members].astype(np.float64)
     top = tall.max(initial=-np.inf)
-    xy = points[members, :2].astype(np.float64)[tall > above]
+    xy = cloud.points[members, :2].astype(np.float64)[tall > above]
     if len(xy) == 0:
         return np.array([0, 0, 0, 0, 0, 0, top])
     offsets = (xy - xy.mean(axis=0)) @ [1, 1j]
     axis = np.exp(0.5j * np.angle((offsets**2).sum()))
-    u, v = along(points, members, axis.real, axis.imag)
+    u, v = along(cloud, members, axis.real, axis.imag)
     u, v = u[tall > above], v[tall > above]
     return np.array([axis.real, axis.imag, u.min(), u.max(), v.min(), v.max(), top])
 
 
-def along(points: np.ndarray, members: np.ndarray, cos: float, sin: float) -> tuple[np.ndarray, np.ndarray]:
-    x, y = points[members, :2].astype(np.float64).T
+def along(cloud: Any, members: np.ndarray, cos: float, sin: float) -> tuple[np.ndarray, np.ndarray]:
+    x, y = cloud.points[members, :2].astype(np.float64).T
     return cos * x + sin * y, cos * y - sin * x
 
 
-def groups(
-    points: np.ndarray, height: np.ndarray, labels: np.ndarray, roles: np.ndarray, clusters: np.ndarray
-) -> tuple[list[Any], Any]:
+def groups(cloud: Any, labeled: Any, clusters: np.ndarray) -> tuple[list[Any], list[int]]:
     """Twin of `edgeperc.objects.persons.fill_person_groups`: the groups, and the points outside of them."""
     whole, loose = [], []
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)
-        role = roles[labels[members]]
-        labeled, n_seen = members[(role > 0) & (role < persons.UNSEEN)], (role != persons.UNSEEN).sum()
-        if len(labeled) == 0:
+        role = labeled.roles[labeled.labels[members]]
+        own, n_seen = members[(role > 0) & (role < persons.UNSEEN)], (role != persons.UNSEEN).sum()
+        if len(own) == 0:
             continue
-        found = measured(points, height, members, -np.inf)
+        found = measured(cloud, members, -np.inf)
         small = found[3] - found[2] <= persons.MAX_LENGTH_M and found[6] <= persons.MAX_TOP_M
-        if small and len(labeled) >= persons.MIN_GROUP_SHARE * n_seen:
+        if small and len(own) >= persons.MIN_GROUP_SHARE * n_seen:
             whole.append(members)
         else:
-            loose += labeled.tolist()
+            loose += own.tolist()
     return whole, loose
 
 
-def border(points: np.ndarray, height: np.ndarray, members: np.ndarray, above: float, found: np.ndarray) -> float:
+def border(cloud: Any, members: np.ndarray, above: float, found: np.ndarray) -> float:
     """Twin of `edgeperc.objects.persons.border_of`: a smoothed histogram."""
     length = found[3] - found[2]
     n = int(min(length / persons.BIN_M, persons.MAX_BINS - 1)) + 1
     edge = max(persons.BIN_M, length / n)
-    u, _ = along(points, members, found[0], found[1])
-    u = u[height[members].astype(np.float64) > above] - found[2]
+    u, _ = along(cloud, members, found[0], found[1])
+    u = u[cloud.height[members].astype(np.float64) > above] - found[2]
     counts = np.bincount(np.clip((u / edge).astype(int), 0, n - 1), minlength=n)
     smooth = np.convolve(counts, [1, 2, 1])[1:-1]
     places = (np.arange(n) + 0.5) * edge
@@ -63,58 +61,52 @@ def border(points: np.ndarray, height: np.ndarray, members: np.ndarray, above: f
     return found[2] + (length / 2 if best is None else places[best])
 
 
-def heads(points: np.ndarray, height: np.ndarray, members: np.ndarray, found: np.ndarray) -> float:
+def heads(cloud: Any, members: np.ndarray, found: np.ndarray) -> float:
     """Twin of `edgeperc.objects.persons.head_width`: sorted places, cut at gaps."""
-    upper = members[height[members].astype(np.float64) > found[6] - persons.HEAD_M]
-    u, v = along(points, upper, found[0], found[1])
+    upper = members[cloud.height[members].astype(np.float64) > found[6] - persons.HEAD_M]
+    u, v = along(cloud, upper, found[0], found[1])
     if np.ptp(v) > persons.MAX_FLAT_M:
         return 0.0
-    gap = max(persons.HEAD_GAP_M, persons.HEAD_GAP_PER_M * np.hypot(*points[upper, :2].astype(np.float64).T).min())
+    gap = max(
+        persons.HEAD_GAP_M, persons.HEAD_GAP_PER_M * np.hypot(*cloud.points[upper, :2].astype(np.float64).T).min()
+    )
     u = np.sort(u)
     parts = np.split(u, np.flatnonzero(np.diff(u) > gap) + 1)
     return max(np.ptp(part) for part in parts)
 
 
-def divided(points: np.ndarray, height: np.ndarray, members: np.ndarray, n_cuts: int = 0) -> list[Any]:
+def divided(cloud: Any, members: np.ndarray, n_cuts: int = 0) -> list[Any]:
     """The parts of a group, each one person."""
-    found = measured(points, height, members, -np.inf)
-    limit = persons.UPPER * found[6]
-    upper = measured(points, height, members, limit)
+    limit = persons.UPPER * measured(cloud, members, -np.inf)[6]
+    upper = measured(cloud, members, limit)
     if upper[3] - upper[2] <= persons.MAX_UPPER_M or n_cuts == persons.MAX_CUTS:
         return [members]
-    u, _ = along(points, members, upper[0], upper[1])
-    first = u <= border(points, height, members, limit, upper)
+    u, _ = along(cloud, members, upper[0], upper[1])
+    first = u <= border(cloud, members, limit, upper)
     parts = [part for part in (members[first], members[~first]) if len(part)]
-    return [own for part in parts for own in divided(points, height, part, n_cuts + 1)]
+    return [own for part in parts for own in divided(cloud, part, n_cuts + 1)]
 
 
 def rows(
-    points: np.ndarray,
-    height: np.ndarray,
-    labels: np.ndarray,
-    roles: np.ndarray,
-    groups: np.ndarray,
-    n_whole: int,
-    clusters: np.ndarray,
-    min_points: int,
+    cloud: Any, labeled: Any, groups: list[np.ndarray], n_whole: int, clusters: np.ndarray, min_points: int
 ) -> np.ndarray:
     """Twin of `edgeperc.objects.persons.fill_persons`: a row for each part that is large enough."""
-    found = []
+    (points, height), role, found = cloud, labeled.roles[labeled.labels], []
     for k, group in enumerate(groups):
-        box = measured(points, height, group, -np.inf)
+        box = measured(cloud, group, -np.inf)
         if not np.isfinite(box).all():
             continue
-        width = heads(points, height, group, box)
-        for part in divided(points, height, group):
+        width = heads(cloud, group, box)
+        for part in divided(cloud, group):
             if len(part) < min_points:
                 continue
-            box = measured(points, height, part, -np.inf)
-            of = roles[labels[part]]
+            box = measured(cloud, part, -np.inf)
+            of = role[part]
             n_seen = n_near = (of != persons.UNSEEN).sum()
             if k >= n_whole:
                 is_near = (clusters == clusters[part[0]]) & (height <= persons.MAX_TOP_M)
-                near = np.flatnonzero(is_near & (roles[labels] != persons.UNSEEN))
-                u, v = along(points, near, box[0], box[1])
+                near = np.flatnonzero(is_near & (role != persons.UNSEEN))
+                u, v = along(cloud, near, box[0], box[1])
                 inside = (u >= box[2] - persons.NEAR_M) & (u <= box[3] + persons.NEAR_M)
                 inside &= (v >= box[4] - persons.NEAR_M) & (v <= box[5] + persons.NEAR_M)
                 n_near = max(n_near, inside.sum())
@@ -130,13 +122,7 @@ def rows(
 
 
 def completed(
-    points: np.ndarray,
-    height: np.ndarray,
-    in_view: np.ndarray,
-    clusters: np.ndarray,
-    walks: int,
-    rides: int,
-    labels: np.ndarray,
+    cloud: Any, in_view: np.ndarray, clusters: np.ndarray, walks: int, rides: int, labels: np.ndarray
 ) -> np.ndarray:
     """Twin of `edgeperc.objects.persons.complete_persons`."""
     labels = labels.copy()
@@ -144,10 +130,10 @@ def completed(
         members = np.flatnonzero(clusters == k)
         own = labels[members]
         n, n_riding, n_seen = np.isin(own, (walks, rides)).sum(), (own == rides).sum(), in_view[members].sum()
-        if n < 5 or n < persons.MIN_GROUP_SHARE * n_seen or np.ptp(points[members, :2], axis=0).max() > 4.6:
+        if n < 5 or n < persons.MIN_GROUP_SHARE * n_seen or np.ptp(cloud.points[members, :2], axis=0).max() > 4.6:
             continue
-        box = measured(points, height, members, -np.inf)
-        upper = measured(points, height, members, persons.UPPER * box[6])
+        box = measured(cloud, members, -np.inf)
+        upper = measured(cloud, members, persons.UPPER * box[6])
         length, top = box[3] - box[2], box[6]
         riding = length > persons.MAX_STRIDE_M or (n_riding > 0 and n_riding >= 0.25 * n)
         if box[5] - box[4] > (0.8 if riding else 0.7):

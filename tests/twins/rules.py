@@ -34,18 +34,10 @@ def columns(points: np.ndarray, height: np.ndarray, limits: Any, labels: np.ndar
 
 
 def tallies(
-    points: np.ndarray,
-    height: np.ndarray,
-    in_view: np.ndarray,
-    labels: np.ndarray,
-    clusters: np.ndarray,
-    cells: Any,
-    is_vehicle: np.ndarray,
-    grid: Any,
-    n: int,
-    n_classes: int,
+    cloud: Any, in_view: np.ndarray, labels: np.ndarray, clusters: np.ndarray, view: Any, n: int, n_classes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Twin of `edgeperc.agreement.votes.fill_tallies`."""
+    (points, height), (cells, is_vehicle, grid) = cloud, view
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
     above = np.zeros((n, 3), np.int32)
@@ -66,79 +58,47 @@ def tallies(
     return counts, bounds, above
 
 
-def inside(points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, box: Any) -> np.ndarray:
+def inside(cloud: Any, on_ground: np.ndarray, box: Any) -> np.ndarray:
     """Points above the ground in a box of `edgeperc.agreement.rules.fill_support`, (n,) bool."""
     x, y, half_l, half_w, cos, sin, highest, *_ = box.tolist()
-    dx, dy = points[:, 0].astype(np.float64) - x, points[:, 1].astype(np.float64) - y
+    dx, dy = cloud.points[:, 0].astype(np.float64) - x, cloud.points[:, 1].astype(np.float64) - y
     with np.errstate(invalid="ignore"):
-        return (
-            ~on_ground
-            & (np.abs(cos * dx + sin * dy) <= half_l)
-            & (np.abs(cos * dy - sin * dx) <= half_w)
-            & (height <= highest)
-        )
+        is_around = (np.abs(cos * dx + sin * dy) <= half_l) & (np.abs(cos * dy - sin * dx) <= half_w)
+        return ~on_ground & is_around & (cloud.height <= highest)
 
 
-def support(
-    points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, labels: np.ndarray, roles: np.ndarray, boxes: Any
-) -> tuple[np.ndarray, Any]:
+def support(cloud: Any, on_ground: np.ndarray, labeled: Any, boxes: Any) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `edgeperc.agreement.rules.fill_support`."""
-    scores, names = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
+    scores, names = np.zeros(len(on_ground), np.float32), np.zeros(len(on_ground), np.uint8)
     for box in boxes:
-        own = inside(points, height, on_ground, box)
-        if np.count_nonzero(roles[labels[own]] == 1) < 0.1 * np.count_nonzero(own):
+        own = inside(cloud, on_ground, box)
+        if np.count_nonzero(labeled.roles[labeled.labels[own]] == 1) < 0.1 * np.count_nonzero(own):
             continue
         better = own & (box["score"] > scores)
         scores[better], names[better] = box["score"], box["label"]
     return scores, names
 
 
-def inside_counts(
-    points: np.ndarray,
-    height: np.ndarray,
-    on_ground: np.ndarray,
-    in_view: np.ndarray,
-    labels: np.ndarray,
-    roles: np.ndarray,
-    boxes: Any,
-) -> np.ndarray:
+def inside_counts(cloud: Any, on_ground: np.ndarray, in_view: np.ndarray, labeled: Any, boxes: Any) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.count_inside`."""
-    own = [inside(points, height, on_ground, box) for box in boxes]
-    is_vehicle = roles[labels] == 1
-    rows = [
-        (np.count_nonzero(o), np.count_nonzero(o & in_view), np.count_nonzero(o & in_view & is_vehicle)) for o in own
-    ]
-    return np.array(rows, np.int64).reshape(-1, 3)
+    seen_vehicles = in_view & (labeled.roles[labeled.labels] == 1)
+    own = [inside(cloud, on_ground, box) for box in boxes]
+    return np.array([[(o & of).sum() for of in (o, in_view, seen_vehicles)] for o in own], np.int64).reshape(-1, 3)
 
 
-def inside_sums(
-    points: np.ndarray,
-    height: np.ndarray,
-    on_ground: np.ndarray,
-    in_view: np.ndarray,
-    labels: np.ndarray,
-    roles: np.ndarray,
-    boxes: Any,
-) -> np.ndarray:
+def inside_sums(cloud: Any, on_ground: np.ndarray, in_view: np.ndarray, labeled: Any, boxes: Any) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.sum_inside`."""
-    sums = np.zeros((len(boxes), 3))
+    (points, height), sums = cloud, np.zeros((len(boxes), 3))
     for row, box in zip(sums, boxes, strict=True):
-        own = inside(points, height, on_ground, box) & (height >= 0.0) & (~in_view | (roles[labels] == 1))
+        own = inside(cloud, on_ground, box) & (height >= 0.0) & (~in_view | (labeled.roles[labeled.labels] == 1))
         levels = points[own, 2].astype(np.float64) - height[own]
         row[:] = np.count_nonzero(own), sum(levels.tolist()), max(0.0, 0.0, *height[own].tolist())
     return sums
 
 
-def verdicts(
-    in_view: np.ndarray,
-    clusters: np.ndarray,
-    table: np.ndarray,
-    roles: np.ndarray,
-    scores: np.ndarray,
-    names: np.ndarray,
-    labels: np.ndarray,
-) -> np.ndarray:
+def verdicts(in_view: np.ndarray, clusters: np.ndarray, table: np.ndarray, support: Any, labeled: Any) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.apply_verdicts`."""
+    (scores, names), (labels, roles) = support, labeled
     agreed = labels.copy()
     for i in np.flatnonzero(in_view):
         old, k = labels[i], clusters[i]
@@ -151,25 +111,17 @@ def verdicts(
     return agreed
 
 
-def votes(in_view: np.ndarray, labels: np.ndarray, roles: np.ndarray, scores: np.ndarray) -> np.ndarray:
+def votes(in_view: np.ndarray, labeled: Any, scores: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.fill_votes`."""
-    role = roles[labels]
+    role = labeled.roles[labeled.labels]
     return np.where(in_view, 1 + 2 * ((role == 1) | (scores >= 0.5)) + 4 * (role == 2), 0)
 
 
 def verdict_table(
-    counts: np.ndarray,
-    bounds: np.ndarray,
-    refused: np.ndarray,
-    roles: np.ndarray,
-    parts: Any,
-    by_share: bool,
-    by_height: bool,
-    is_filled: Any,
-    eye_m: float,
-    slope: float,
+    counts: np.ndarray, bounds: np.ndarray, refused: np.ndarray, roles: np.ndarray, parts: Any, applied: Any, sight: Any
 ) -> np.ndarray:
     """Twin of `edgeperc.agreement.votes.fill_verdicts`: all clusters at once."""
+    (by_share, by_height, is_filled), (eye_m, slope) = applied, sight
     vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
     seen = np.maximum(counts[:, -1], 1)
     vehicle_share, person_share = counts[:, vehicles].sum(axis=1) / seen, counts[:, persons].sum(axis=1) / seen
@@ -198,10 +150,9 @@ def verdict_table(
     return table
 
 
-def ground(
-    points: np.ndarray, height: np.ndarray, on_ground: np.ndarray, roles: np.ndarray, labels: np.ndarray
-) -> np.ndarray:
+def ground(cloud: Any, on_ground: np.ndarray, labeled: Any) -> np.ndarray:
     """Twin of `edgeperc.agreement.rules.clear_ground`."""
+    (points, height), (labels, roles) = cloud, labeled
     row, col, known = cells_of(points, 0.2, 1024)
     cleared = labels.copy()
     for role in (1, 2):
@@ -215,20 +166,10 @@ def ground(
 
 
 def cells(
-    points: np.ndarray,
-    height: np.ndarray,
-    in_view: np.ndarray,
-    labels: np.ndarray,
-    roles: np.ndarray,
-    by_height: Any,
-    grid: Any,
-    drivable: np.ndarray,
-    is_vehicle: Any,
-    in_box: np.ndarray,
-    cells: Any,
+    cloud: Any, in_view: np.ndarray, labeled: Any, by_height: bool, view: Any, drivable: int, in_box: np.ndarray
 ) -> np.ndarray:
     """Twin of `edgeperc.agreement.cells.fill_marks` and `clear_cells`."""
-    far, left, cell_m = grid
+    (points, height), (labels, roles), (cells, is_vehicle, (far, left, cell_m)) = cloud, labeled, view
     returns, vehicles, others = np.zeros(cells.shape, int), np.zeros(cells.shape, bool), np.zeros(cells.shape, bool)
     with np.errstate(invalid="ignore", over="ignore"):
         row = (far - points[:, 0].astype(np.float64)) / cell_m

@@ -217,17 +217,9 @@ def clumped_path(primitive: np.ndarray, place: np.ndarray, path: float) -> float
     return (1.0 - own) * clump + own * path
 
 
-def cast(
-    primitives: np.ndarray,
-    scene: Any,
-    pose: Any,
-    elevations: np.ndarray,
-    azimuths: np.ndarray,
-    reach: float,
-    key: int,
-    clumped: bool,
-) -> tuple[np.ndarray, np.ndarray]:
+def cast(primitives: np.ndarray, scene: Any, pose: np.ndarray, rays: Any) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `fill_cast`: tries every primitive near the ray, and walks over the ground in steps of 5 mm."""
+    elevations, azimuths, reach, key, clumped = rays
     shape = (len(elevations), len(azimuths))
     centers = primitives[:, 4:7]
     with np.errstate(invalid="ignore"):

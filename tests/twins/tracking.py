@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from edgeperc.tracking.lives import EXPECTED, MOST_EXISTENCE, MOST_HIDDEN, TRACK
+
 
 def moved(mode: Any, state: np.ndarray, dt: float) -> np.ndarray:
     """Twin of `edgeperc.tracking.ukf.move`."""
@@ -76,24 +78,17 @@ def pda_update(
     return mean + K @ off, total
 
 
-def likelihoods(
-    means: np.ndarray,
-    predicted: np.ndarray,
-    sigmas: np.ndarray,
-    groups: np.ndarray,
-    detections: np.ndarray,
-    detection_groups: np.ndarray,
-    gates: np.ndarray,
-) -> np.ndarray:
+def likelihoods(tracks: Any, gates: Any, detections: Any) -> np.ndarray:
     """Twin of `edgeperc.tracking.jpda.fill_likelihoods`, without the weights."""
-    out = np.zeros((len(groups), 3, len(detections)))
-    for i, j in np.ndindex(len(groups), len(detections)):
-        if groups[i] != detection_groups[j]:
+    (means, predicted, _), (sigmas, _, groups, limits) = tracks, gates
+    out = np.zeros((len(groups), 3, len(detections.places)))
+    for i, j in np.ndindex(len(groups), len(detections.places)):
+        if groups[i] != detections.groups[j]:
             continue
         inside = False
         for mode in range(3):
-            off, S = innovation(means[i, mode], predicted[i, mode], sigmas[i], detections[j])
-            inside |= bool(off[:2] @ np.linalg.inv(S[:2, :2]) @ off[:2] <= gates[i] ** 2)
+            off, S = innovation(means[i, mode], predicted[i, mode], sigmas[i], detections.places[j])
+            inside |= bool(off[:2] @ np.linalg.inv(S[:2, :2]) @ off[:2] <= limits[i] ** 2)
             density = math.sqrt((2 * math.pi) ** 3 * np.linalg.det(S))
             out[i, mode, j] = math.exp(-off @ np.linalg.inv(S) @ off / 2) / density
         out[i, :, j] *= inside
@@ -262,26 +257,17 @@ def updated_fronts(
 
 
 def lives(
-    tracks: np.ndarray,
-    classes: np.ndarray,
-    beta: np.ndarray,
-    hidden: np.ndarray,
-    logits: np.ndarray,
-    kinds: np.ndarray,
-    dt: float,
-    most_hidden: float,
-    expected: np.ndarray,
-    most: int,
+    tracks: np.ndarray, classes: Any, beta: np.ndarray, hidden: np.ndarray, logits: np.ndarray, kinds: Any, dt: float
 ) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.update_lives`: the tracks as they are then."""
     tracks = tracks.copy()
     hit = beta[:, 0] < 0.5
     best = np.argmax(beta[hit, 1:], axis=1) if hit.any() else np.zeros(0, int)
-    existence = tracks["existence"] + np.log1p(-classes["detection"] * (1 - most_hidden * hidden))
+    existence = tracks["existence"] + np.log1p(-classes["detection"] * (1 - MOST_HIDDEN * hidden))
     again = np.maximum(tracks["existence"][hit], -classes["sure_logit"][hit])
-    existence[hit] = np.minimum(again + np.maximum(logits[best], 0) + expected, most)
+    existence[hit] = np.minimum(again + np.maximum(logits[best], 0) + EXPECTED, MOST_EXISTENCE)
     tracks["existence"] = existence
-    tracks["chances"] += np.where(hit, 1, 1 - most_hidden * hidden)
+    tracks["chances"] += np.where(hit, 1, 1 - MOST_HIDDEN * hidden)
     tracks["age_s"] += dt
     tracks["hits"] += hit
     tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
@@ -296,10 +282,10 @@ def lives(
     return tracks
 
 
-def newborn(first_id: int, detections: np.ndarray, classes: np.ndarray, most: int, dtype: np.dtype) -> np.ndarray:
+def newborn(first_id: int, detections: Any, classes: np.ndarray) -> np.ndarray:
     """Twin of `edgeperc.tracking.lives.fill_newborn`."""
     places, shapes, logits, told, kinds, _, ranges, sources = detections
-    tracks = np.zeros(len(kinds), dtype)
+    tracks = np.zeros(len(kinds), TRACK)
     for track, kind, of, detection, shape, logit, front, distance in zip(
         tracks, kinds, classes, places, shapes, logits, told, ranges, strict=True
     ):
@@ -319,7 +305,7 @@ def newborn(first_id: int, detections: np.ndarray, classes: np.ndarray, most: in
         track["state"], track["covariance"] = combination(track["states"], track["covariances"], track["modes"])
         track["shape"], track["shape_variance"] = shape, (of["shape"] * farther) ** 2
         track["logit_sum"], track["last_logit"], track["chances"], track["hits"] = logit, logit, 1, 1
-        track["existence"] = min(logit - of["sure_logit"], most)
+        track["existence"] = min(logit - of["sure_logit"], MOST_EXISTENCE)
     tracks["id"], tracks["source"] = first_id + np.arange(len(tracks)), sources
     return tracks
 
