@@ -75,22 +75,21 @@ def test_state_follows_a_steady_car() -> None:
     assert (scores.tolist(), sources.tolist()) == ([29.0], [-1])
 
 
-def test_greedy_takes_the_best_pair_and_the_other_the_best_sum() -> None:
-    """Tracks at 0 and 1.9; detections at 1 and 2. Greedy: 1.9 takes 2. Then both find a partner either way."""
-    for greedy in (False, True):
-        tracker = Ab3dmot(Settings(by_distance=True, greedy=greedy, least=-1.5, min_hits=1, max_age=3))
-        follow(tracker, [box(0.0), box(1.9)])
-        assert tracker.update([box(2.0), box(1.0)], [0.0, 0.0])[3].tolist() == [1, 0]
-    # Tracks at 0 and 3; detections at 1.4 and 4.6 (1.6 too far). The best sum pairs 1.4 with 0 and 4.6 with 3.
-    for greedy, expected in ((False, [0, 1]), (True, [0, 1])):
-        tracker = Ab3dmot(Settings(by_distance=True, greedy=greedy, least=-1.7, min_hits=1, max_age=3))
-        follow(tracker, [box(0.0), box(3.0)])
-        assert tracker.update([box(1.4), box(4.6)], [0.0, 0.0])[3].tolist() == expected
-    # Tracks at 0 and 3; detections at 2 and 6: greedy gives 2 to the track at 3, and 6 is too far from 0.
-    for greedy, expected in ((False, [0, 1]), (True, [-1, 0, 1])):
-        tracker = Ab3dmot(Settings(by_distance=True, greedy=greedy, least=-3.5, min_hits=1, max_age=3))
-        follow(tracker, [box(0.0), box(3.0)])
-        assert tracker.update([box(2.0), box(6.0)], [0.0, 0.0])[3].tolist() == expected
+@pytest.mark.parametrize(
+    ("tracks", "found", "least", "best_sum", "greedily"),
+    [
+        ((0.0, 1.9), (2.0, 1.0), -1.5, [1, 0], [1, 0]),  # 1.9 takes 2; then both find a partner either way
+        ((0.0, 3.0), (1.4, 4.6), -1.7, [0, 1], [0, 1]),  # 0 and 4.6 are too far apart; so are 1.4 and 3 for the sum
+        ((0.0, 3.0), (2.0, 6.0), -3.5, [0, 1], [-1, 0, 1]),  # the track at 3 takes 2, and 6 is too far from 0
+    ],
+)
+def test_greedy_takes_the_best_pair_and_the_other_the_best_sum(
+    tracks: tuple[float, ...], found: tuple[float, ...], least: float, best_sum: list[int], greedily: list[int]
+) -> None:
+    for greedy, expected in ((False, best_sum), (True, greedily)):
+        tracker = Ab3dmot(Settings(by_distance=True, greedy=greedy, least=least, min_hits=1, max_age=3))
+        follow(tracker, [box(x) for x in tracks])
+        assert tracker.update([box(x) for x in found], [0.0, 0.0])[3].tolist() == expected
 
 
 def test_boxes_that_are_not_finite_overlap_nothing() -> None:

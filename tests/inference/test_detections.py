@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,12 @@ def assert_alike(found: list[Box] | tuple[Box, ...], wanted: list[tuple[str, flo
         assert 0.5 <= box.front <= 1.0
 
 
+def assert_near(found: Sequence[Box], wanted: Sequence[Box], most_m: float) -> None:
+    """Boxes of the same classes at the same places."""
+    assert [box.label for box in found] == [box.label for box in wanted]
+    np.testing.assert_allclose([box.center for box in found], [box.center for box in wanted], atol=most_m, rtol=0)
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize("kind", HEADS)
 def test_boxes_are_those_of_torch(
@@ -178,10 +185,8 @@ def test_features_by_the_kernel_are_those_in_the_graph(
     )
     for path in graphs:
         found = perceived(path, points).boxes
-        assert [box.label for box in found] == [box.label for box in wanted]
-        for box, other in zip(found, wanted, strict=True):
-            assert box.center == pytest.approx(other.center, abs=1e-3)
-            assert box.size == pytest.approx(other.size, abs=1e-3)
+        assert_near(found, wanted, 1e-3)
+        np.testing.assert_allclose([box.size for box in found], [box.size for box in wanted], atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("height_m", [1.2, 1.73, 2.5])
@@ -193,9 +198,7 @@ def test_boxes_are_in_the_frame_of_the_scan(
     mounting = Mounting(height_m, 1.0, -2.0, 90.0)
     found = perceived(models["centers"], ModelFrame(mounting).move_back(points), mounting=mounting).boxes
     back = ModelFrame(mounting).move_boxes(found)
-    assert [box.label for box in back] == [box.label for box in wanted]
-    for box, other in zip(back, wanted, strict=True):
-        assert box.center == pytest.approx(other.center, abs=0.01)
+    assert_near(back, wanted, 0.01)
     x, y, _ = wanted[0].center
     assert math.hypot(found[0].center[0] - y, found[0].center[1] + x) < 1.0  # ahead is to the right of the sensor
 
@@ -220,9 +223,7 @@ def test_the_frame_of_the_training_points(
     frame = ModelFrame(training)
     wanted = frame.move_boxes(perceived(models["anchors"], points).boxes)
     found = perceived(path, frame.move(points)).boxes
-    assert [box.label for box in found] == [box.label for box in wanted]
-    for box, other in zip(found, wanted, strict=True):
-        assert box.center == pytest.approx(other.center, abs=0.01)
+    assert_near(found, wanted, 0.01)
 
 
 @pytest.mark.compiled
@@ -238,10 +239,8 @@ def test_a_full_turn_has_the_boxes_of_each_quarter(models: dict[str, Path], poin
         alike = sorted((box for box in every if box.label == kind), key=lambda box: -box.score)
         rows = twins.decode.nms(rectangles(alike), MAX_IOU)
         kept += [box for box, keep in zip(alike, rows, strict=True) if keep]
-    assert len(whole) == len(kept) > 20
-    for box, other in zip(whole, sorted(kept, key=lambda box: -box.score), strict=True):
-        assert box.label == other.label
-        assert box.center == pytest.approx(other.center, abs=1e-3)
+    assert len(kept) > 20
+    assert_near(whole, sorted(kept, key=lambda box: -box.score), 1e-3)
 
 
 def test_it_runs_beside_the_other_networks_and_is_tracked(models: dict[str, Path], points: NDArray[np.float32]) -> None:
@@ -393,16 +392,8 @@ def test_groups_of_classes_come_in_one_output_or_several(seed: int) -> None:
     each |= {"heatmap0": ("heatmap", maps["heatmap"][:1]), "heatmap1": ("heatmap", maps["heatmap"][1:])}
     assert decoded(each) == one
     boxes = np.concatenate(joined)
-    assert (
-        decoded(
-            {
-                "cls_score": ("heatmap", maps["heatmap"]),
-                "bbox_pred": ("reg_height_dim_vel", boxes),
-                "dir_cls_pred": ("rot", maps["rot"]),
-            }
-        )
-        == one
-    )
+    heat, turns = ("heatmap", maps["heatmap"]), ("rot", maps["rot"])
+    assert decoded({"cls_score": heat, "bbox_pred": ("reg_height_dim_vel", boxes), "dir_cls_pred": turns}) == one
 
 
 @pytest.mark.parametrize("seed", range(3))

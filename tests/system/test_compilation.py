@@ -61,6 +61,14 @@ def lines() -> list[str]:
     return str(terminal.getvalue()).split("\r")
 
 
+def watched(kernels: list[Any]) -> None:
+    """Compile some kernels, during which those who watch are told twice."""
+    every = list(kernels)
+    with Compilation(lambda: every):
+        tell_watchers()
+        tell_watchers()
+
+
 def test_a_terminal_shows_one_line_with_a_bar(kernels: list[Any]) -> None:
     every = list(kernels)
     with Compilation(lambda: every, n_processes=2):
@@ -79,9 +87,7 @@ def test_a_terminal_shows_one_line_with_a_bar(kernels: list[Any]) -> None:
 @pytest.mark.parametrize("n_missing", [0, 1, 3])
 def test_few_kernels_are_not_worth_a_line(kernels: list[Any], n_missing: int, caplog: pytest.LogCaptureFixture) -> None:
     del kernels[n_missing:]
-    with Compilation(lambda: list(kernels)):
-        tell_watchers()
-        tell_watchers()
+    watched(kernels)
     assert lines() == [""]
 
 
@@ -104,12 +110,9 @@ def test_what_is_not_kept_is_not_compiled_once(kernels: list[Any], monkeypatch: 
 def test_nothing_is_written_where_no_user_reads_it(
     kernels: list[Any], stream: io.StringIO | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    every = list(kernels)
     with monkeypatch.context() as patch:
         patch.setattr(compilation.sys, "stderr", stream)
-        with Compilation(lambda: every):
-            tell_watchers()
-            tell_watchers()
+        watched(kernels)
     assert stream is None or stream.getvalue() == ""
 
 
@@ -119,10 +122,7 @@ def test_a_program_can_have_it_its_own_way(kernels: list[Any], why: str, monkeyp
         monkeypatch.setattr(compilation.logger, "hasHandlers", lambda: True)
     else:
         monkeypatch.setattr(logging.getLogger(why), "level", logging.WARNING)
-    every = list(kernels)
-    with Compilation(lambda: every):
-        tell_watchers()
-        tell_watchers()
+    watched(kernels)
     assert lines() == [""]
 
 
@@ -130,19 +130,13 @@ def test_the_log_has_the_line_wherever_standard_error_goes(
     kernels: list[Any], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="edgeperc.system.compilation")
-    every = list(kernels)
-    with Compilation(lambda: every):
-        tell_watchers()
-        tell_watchers()
+    watched(kernels)
     assert caplog.messages == ["compiling 80 functions once for this computer, about 20 s"]
 
 
 def test_a_terminal_that_went_away_stops_nothing(kernels: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compilation.sys, "stderr", Closed())
-    every = list(kernels)
-    with Compilation(lambda: every):
-        tell_watchers()
-        tell_watchers()
+    watched(kernels)
 
 
 def test_an_error_leaves_the_line_and_what_is_printed_next_begins_its_own(kernels: list[Any]) -> None:

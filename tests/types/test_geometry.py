@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 import twins.decode
 from edgeperc.errors import PointsError
-from edgeperc.types import geometry
 from edgeperc.types.geometry import (
     bounding_rectangles,
     draw_footprints,
@@ -139,14 +138,6 @@ def test_bounds_hold_the_corners_tightly() -> None:
         np.testing.assert_allclose(bounds[:2] + bounds[2:4] / 2.0, corners.max(axis=0), atol=1e-12)
         np.testing.assert_allclose(bounds[:2] - bounds[2:4] / 2.0, corners.min(axis=0), atol=1e-12)
         assert bounds[4] == 0.0
-
-
-def test_interpreted_and_compiled_kernels_agree() -> None:
-    a = some_rectangles(np.random.default_rng(4), 6)
-    compiled, interpreted = np.empty((6, 6)), np.empty((6, 6))
-    geometry.fill_oriented_iou(a, a, compiled)
-    getattr(geometry.fill_oriented_iou, "py_func", geometry.fill_oriented_iou)(a, a, interpreted)
-    np.testing.assert_allclose(compiled, interpreted, atol=1e-13)
 
 
 def test_rectangles_are_the_boxes_footprints() -> None:
