@@ -219,13 +219,6 @@ def test_rendering_uses_the_profiles_range() -> None:
         render(raw.astype(np.float64), byte)
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_profile_is_read_back_from_its_file(name: str, tmp_path: Path) -> None:
-    file = tmp_path / "sensor.json"
-    file.write_text(SENSORS[name].to_json(), encoding="utf-8")
-    assert get_sensor(file) == get_sensor(str(file)) == SENSORS[name]
-
-
 def test_built_in_functions_match_their_source() -> None:
     functions = {name: profile.remission for name, profile in SENSORS.items() if profile.remission}
     assert set(functions) == {"hdl-32e", "vlp-16", "vlp-32c", "pandar64"}
@@ -517,16 +510,21 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, shell: Shell) -> None:
     assert "no scan in this folder" in shell.err("fit-sensor", tmp_path / "none", *fit[2:])
 
 
+def folder_of(root: Path, scans: dict[str, np.ndarray], **description: Any) -> Path:
+    """Labeled scans, whose files of boxes are empty."""
+    for part in ("velodyne", "label"):
+        (root / part).mkdir(parents=True)
+    for name, points in scans.items():
+        points.tofile(root / f"velodyne/{name}.bin")
+        (root / f"label/{name}.txt").touch()
+    (root / "scans.json").write_text(json.dumps({"schema": 1, "sensor": "hdl-64e"} | description))
+    return root
+
+
 def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "velodyne").mkdir()
-    (tmp_path / "label").mkdir()
-    scan = urban(4)
-    for name in ("a", "b"):
-        scan.points.tofile(tmp_path / "velodyne" / f"{name}.bin")
-        (tmp_path / "label" / f"{name}.txt").write_text("")
-    names = {"car": "car", "*": "ignore"}
-    description = {"schema": 1, "sensor": "hdl-64e", "boxes": names, "splits": {"train": ["a"], "test": ["b"]}}
-    (tmp_path / "scans.json").write_text(json.dumps(description))
+    scan, names = urban(4), {"car": "car", "*": "ignore"}
+    splits = {"train": ["a"], "test": ["b"]}
+    folder_of(tmp_path, dict.fromkeys("ab", scan.points), boxes=names, splits=splits)
     assert compare([str(tmp_path)], "pointseg")[str(tmp_path)]["n_scans"] == 1
     seen = {"pointseg 1": {scan_hash(scan.points)}}
     monkeypatch.setattr("edgeperc.evaluation.transfer.training_scans_of", lambda cards: seen)
@@ -541,17 +539,12 @@ def test_eval_sensors_finds_the_mounting_of_each_drive(tmp_path: Path) -> None:
     road = scan.points[scan.points[:, 2] < -1.5].copy()
     road[:, :3] = (road[:, :3] + [0.0, 0.0, 0.9]) @ np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]).T
     boxes = [" ".join(map(str, (box.label, *box.center, *box.size, box.yaw))) for box in scan.boxes]
-    description = {"schema": 1, "sensor": "hdl-64e", "boxes": {"car": "car", "*": "ignore"}}
     for name, drives in (("alone", "b"), ("both", "aaaaab")):
-        for folder in ("velodyne", "label"):
-            (tmp_path / name / folder).mkdir(parents=True)
-        (tmp_path / name / "scans.json").write_text(json.dumps(description))
-        (tmp_path / name / "frames.csv").write_text(
-            "\n".join(["name,drive", *(f"{k},{drive}" for k, drive in enumerate(drives))])
-        )
-        for k, drive in enumerate(drives):
-            (road if drive == "a" else scan.points).tofile(tmp_path / name / f"velodyne/{k}.bin")
-            (tmp_path / name / f"label/{k}.txt").write_text("\n".join(boxes) if drive == "b" else "")
+        scans = {f"{k}": road if drive == "a" else scan.points for k, drive in enumerate(drives)}
+        folder = folder_of(tmp_path / name, scans, boxes={"car": "car", "*": "ignore"})
+        rows = ["name,drive", *(f"{k},{drive}" for k, drive in enumerate(drives))]
+        (folder / "frames.csv").write_text("\n".join(rows))
+        (folder / f"label/{len(drives) - 1}.txt").write_text("\n".join(boxes))
     alone, both = (compare([str(tmp_path / name)])[str(tmp_path / name)] for name in ("alone", "both"))
     assert both["n_scans"] == 6
     for adaptation in ("none", "both"):
@@ -561,12 +554,8 @@ def test_eval_sensors_finds_the_mounting_of_each_drive(tmp_path: Path) -> None:
 def test_eval_sensors_measures_points_where_the_objects_network_was_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
-    (tmp_path / "velodyne").mkdir()
-    (tmp_path / "label").mkdir()
     scan = urban(4)
-    scan.points.tofile(tmp_path / "velodyne" / "a.bin")
-    (tmp_path / "label" / "a.txt").write_text("")
-    (tmp_path / "scans.json").write_text(json.dumps({"schema": 1, "sensor": "hdl-64e", "boxes": {"*": "ignore"}}))
+    folder_of(tmp_path, {"a": scan.points}, boxes={"*": "ignore"})
     seen = {"objects 1": {scan_hash(scan.points)}}
     monkeypatch.setattr("edgeperc.evaluation.judge.training_scans_of", lambda cards: seen)
     printed = shell.out("eval-sensors", tmp_path)
@@ -578,20 +567,17 @@ def test_eval_sensors(tmp_path: Path, shell: Shell) -> None:
     """Two simulated scans, and the same street as boxes and as range images."""
     scan = urban(4)
     boxes, images = tmp_path / "boxes", tmp_path / "images"
-    for folder in (boxes / "velodyne", boxes / "label", images):
-        folder.mkdir(parents=True)
+    images.mkdir()
     near = scan.points[np.hypot(*scan.points[:, :2].T) < 40.0]
     # Fired together: all beams of one azimuth, then the next.
     near = near[np.lexsort((near[:, 2], np.round(np.arctan2(near[:, 1], near[:, 0]) / 0.003)))]
-    (near + np.array([3.0, -2.0, 0.5, 0.0], np.float32)).tofile(boxes / "velodyne" / "a.bin")
+    columns = ["class", "-", "x", "y", "z", "l", "w", "h", "yaw"]
+    names = {name: name for name in ("car", "van", "truck", "pedestrian", "cyclist")} | {"*": "ignore"}
+    folder_of(boxes, {"a": near + np.array([3.0, -2.0, 0.5, 0.0], np.float32)}, boxes=names, box_columns=columns)
     with (boxes / "label" / "a.txt").open("w") as file:
         for box in scan.boxes:
             x, y, z = np.add(box.center, (3.0, -2.0, 0.5))
             print(box.label.title(), 0, x, y, z, *box.size, box.yaw, file=file)
-    columns = ["class", "-", "x", "y", "z", "l", "w", "h", "yaw"]
-    names = {name: name for name in ("car", "van", "truck", "pedestrian", "cyclist")} | {"*": "ignore"}
-    description = {"schema": 1, "sensor": "hdl-64e", "boxes": names, "box_columns": columns}
-    (boxes / "scans.json").write_text(json.dumps(description))
     index = project(scan.points)
     image = np.zeros((64, 512, 6), np.float32)
     seen = index >= 0

@@ -97,10 +97,12 @@ def test_own_and_changed_profiles() -> None:
         own.columns = 3
 
 
-def test_a_profile_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    """Editors of Windows write one."""
-    (tmp_path / "own.json").write_text(SENSORS["vlp-16"].to_json(), "utf-8-sig")
-    assert get_sensor(tmp_path / "own.json") == SENSORS["vlp-16"]
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # editors of Windows write a byte order mark
+def test_a_profile_is_read_back_from_its_file(tmp_path: Path, name: str, encoding: str) -> None:
+    file = tmp_path / "own.json"
+    file.write_text(SENSORS[name].to_json(), encoding)
+    assert get_sensor(file) == get_sensor(str(file)) == SENSORS[name]
 
 
 @pytest.mark.parametrize("name", ["hdl64", "HDL-64E", "", None, ["vlp-16"]])
