@@ -513,13 +513,6 @@ def test_the_scans_of_another_vehicle_are_checked_as_the_first(
             perceive(faulty(scan.points, fault))
 
 
-def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        answer = Perceiver("pointseg", provider="cpu", on_mismatch="ignore")(faulty(scan.points, "millimeters"))
-    assert answer.fitness == ()
-
-
 def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
     bad = faulty(scan.points, "upside down")

@@ -420,29 +420,6 @@ def test_a_golden_record_of_a_small_output_may_be_short() -> None:
         golden.check_output("y", 4)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("range_median_m", [0.0, 0.0]),
-        ("range_median_m", [5.0, 1.0]),
-        ("beams", [NAN, 1.0]),
-        ("beams", [0.0, 1e308]),
-        ("azimuth_deg", [-45.0, 45.0]),
-        ("n_scans", 0),
-        ("n_scans", 10**300),
-        ("n_scans", "3"),
-        ("ground_m", [10**400, 10**400]),
-    ],
-)
-def test_a_fitness_profile_out_of_its_bounds_is_named(name: str, value: object) -> None:
-    from edgeperc.preprocess.fitness import FitnessProfile
-
-    profile = dict(resolve("lodnn")[0].card.fitness or {})
-    assert FitnessProfile.from_dict(profile).to_dict() == profile
-    with pytest.raises(CardError, match=rf"fitness\.{name}(\[.\])? is .*expected"):
-        FitnessProfile.from_dict(profile | {name: value})
-
-
 def opened_or_refused(blob: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = write(Path(folder), blob)
