@@ -32,6 +32,11 @@ def _gross(text: str) -> Finding:
     return Finding(text, True)
 
 
+def _alone(text: str) -> tuple[Finding, ...]:
+    """All there is to say of a scan that is refused."""
+    return (_gross(text),)
+
+
 def check_fitness(
     points: Points, profile: FitnessProfile, sensor: SensorProfile, frame: ModelFrame | None = None
 ) -> tuple[Finding, ...]:
@@ -132,7 +137,7 @@ def _ground_far_around(sample: Floats) -> float | None:
 
 def _findings(scan: Measures | None, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
     if scan is None:
-        return (_gross("The scan holds no finite point: is the sensor connected and its driver running?"),)
+        return _alone("The scan holds no finite point: is the sensor connected and its driver running?")
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
         return (_too_few(scan, profile, sensor),)  # too few points for the other checks
     findings = _geometry_findings(scan, profile, sensor)
@@ -160,12 +165,10 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
     """Describe a scan of which nearly all was dropped: too near, in another unit or no returns; or in the ego box."""
     n_left = len(points) - dropped.total
     if dropped.ego > _NEARLY_ALL * max(n_left, dropped.too_near):
-        return (
-            _gross(
-                f"{dropped.ego:,} of the {len(points):,} points of the scan lie inside the ego_box of the profile "
-                f"{sensor.name}, {sensor.ego_box}, and are dropped as the own vehicle: expected its lowest and highest "
-                "x, y and z about the sensor, along the axes of the scan, in meters."
-            ),
+        return _alone(
+            f"{dropped.ego:,} of the {len(points):,} points of the scan lie inside the ego_box of the profile "
+            f"{sensor.name}, {sensor.ego_box}, and are dropped as the own vehicle: expected its lowest and highest "
+            "x, y and z about the sensor, along the axes of the scan, in meters."
         )
     if dropped.too_near <= _NEARLY_ALL * n_left:
         return ()
@@ -177,21 +180,17 @@ def check_dropped(points: Points, dropped: DroppedPoints, sensor: SensorProfile)
         street = measure(points[known] * factors, (180.0, -180.0))
     # Empty beams are on one ray, or at ranges that show no ground.
     if street is not None and street.ground_m is not None and street.beams >= min(_FEWEST_ROWS, sensor.n_beams):
-        return (
-            _gross(
-                f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
-                f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
-                "another unit; convert them to meters."
-            ),
+        return _alone(
+            f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
+            f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
+            "another unit; convert them to meters."
         )
     if n_left:
         return ()
-    return (
-        _gross(
-            f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
-            f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
-            f"{sensor.name} another sensor's?"
-        ),
+    return _alone(
+        f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
+        f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
+        f"{sensor.name} another sensor's?"
     )
 
 
@@ -385,11 +384,9 @@ def check_beams(points: Points, sensor: SensorProfile) -> tuple[Finding, ...]:
     as_is, turned = _off_beams(scan, sensor)
     if as_is <= _ASYMMETRIC_DEG or turned >= 0.5 * as_is:
         return ()
-    return (
-        _gross(
-            f"The points lie between {lowest:.0f} and {highest:.0f} deg of elevation, and the beams of the "
-            f"{sensor.name} between {down:.0f} and {up:.0f}: it is mounted upside down, or z points down: {_TURN_OVER}"
-        ),
+    return _alone(
+        f"The points lie between {lowest:.0f} and {highest:.0f} deg of elevation, and the beams of the "
+        f"{sensor.name} between {down:.0f} and {up:.0f}: it is mounted upside down, or z points down: {_TURN_OVER}"
     )
 
 
@@ -426,11 +423,9 @@ def check_ground(
         as_is, turned = _off_beams(scan, sensor)
         if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and turned - as_is > _ASYMMETRIC_DEG:
             return ()
-    return (
-        _gross(
-            "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
-            f"down: {_TURN_OVER}"
-        ),
+    return _alone(
+        "The ground seems to lie above the sensor, and there is none below: it is mounted upside down, or z points "
+        f"down: {_TURN_OVER}"
     )
 
 
@@ -447,11 +442,9 @@ def check_hanging(
     turned[:, :3] = points[:, :3] @ known.rotation().T.astype(np.float32)
     if not check_ground(turned, support_of, below_of):
         return ()
-    return (
-        _gross(
-            f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
-            "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic)."
-        ),
+    return _alone(
+        f"With the given roll of {known.roll_deg:g} deg, the ground lies above the sensor, and none below: it "
+        "does not hang upside down, or the points are turned already: leave out the roll (--roll, --extrinsic)."
     )
 
 
