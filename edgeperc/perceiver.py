@@ -282,7 +282,7 @@ class Perceiver:
         self._begin(self.sensor.mounting if mounting is None else mounting)
         cards = [card for card in map(_card_of, wanted) if card is not None]
         with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
-            self._construct(wanted, provider, precision, n_threads, trusted)
+            self._construct(wanted, {card.view.kind for card in cards}, provider, precision, n_threads, trusted)
 
     def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
         """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
@@ -326,13 +326,13 @@ class Perceiver:
     def _construct(
         self,
         wanted: Sequence[str | os.PathLike[str]],
+        kinds: set[str],
         provider: str,
         precision: str,
         n_threads: int | None,
         trusted: bool,
     ) -> None:
         """Load the models, assemble the pipeline and compile every kernel."""
-        kinds = {card.view.kind for card in map(_card_of, wanted) if card is not None}
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
         self.sessions = tuple(
             Session(model, provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted)
