@@ -50,7 +50,18 @@ BOUNDS = ["low_x", "low_y", "high_x", "high_y", "top"]  # of clusters
 coordinates = st.floats(-9.0, 19.0, width=32) | st.sampled_from([0.0, -0.0, 60.0, 3e38, math.nan, math.inf, -math.inf])
 heights = st.floats(-1.0, 7.0, width=32) | st.sampled_from([0.0, 0.3, 2.0, math.nan, math.inf, -math.inf])
 rows = st.tuples(coordinates, coordinates, heights, st.booleans(), st.booleans(), st.integers(0, 3), st.integers(-1, 5))
-scenes = st.lists(rows, max_size=60)
+
+
+def crowd(seed: int) -> list[tuple[float, float, float, bool, bool, int, int]]:
+    """Eighty rows close to one another; hypothesis itself draws three on average."""
+    rng = np.random.default_rng(seed)
+    heights = np.where(rng.random(80) < 0.5, rng.uniform(-1.0, 7.0, 80), rng.choice([0.0, 0.05, 0.3, 1.0, 2.0], 80))
+    flags, places = rng.random((2, 80)) < 0.5, rng.uniform([[-3.0], [-4.0]], [[7.0], [4.0]], (2, 80))
+    columns = (*places, heights, *flags, rng.integers(0, 4, 80), rng.integers(-1, 6, 80))
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+scenes = st.lists(rows, max_size=60) | st.integers(0, 2**32 - 1).map(crowd)
 boxes_of = st.lists(
     st.builds(
         lambda x, y, length, width, yaw, score, label: Box(label, score, (x, y, -1.0), (length, width, 1.5), yaw),
