@@ -33,6 +33,8 @@ coordinates = st.floats(-12.0, 12.0, width=32) | st.sampled_from([0.0, -0.0, mat
 heights = st.floats(-2.5, 2.0, width=32) | st.sampled_from([ROAD_Z, -1.7, -1.6, math.nan, math.inf])
 clouds = st.lists(st.tuples(coordinates, coordinates, heights), max_size=60).map(
     lambda rows: np.array([(*row, 0.5) for row in rows], np.float32).reshape(-1, 4)
+) | st.integers(0, 2**32 - 1).map(  # hypothesis itself draws three points on average
+    lambda seed: scan_of(np.random.default_rng(seed).uniform([-12.0, -12.0, -2.5], [12.0, 12.0, 2.0], (100, 3)))
 )
 
 
