@@ -1,4 +1,4 @@
-"""Captures and scan files: damaged ones through `edgeperc.read_scans`.
+"""Captures: damaged ones through `edgeperc.read_scans`.
 
 The process that decodes captures is forked from this one, where the libraries are loaded already; otherwise it runs
 what the product runs, `edgeperc.readers.worker.main` with its limits, and `edgeperc.readers.apart` reads its replies.
@@ -37,11 +37,10 @@ from edgeperc.errors import PointsError
 from edgeperc.readers import apart, worker
 from edgeperc.readers.captures import read_scans
 from edgeperc.readers.decoders import decode
-from edgeperc.readers.files import read_points
 
-from .mutate import mutated_bytes, mutated_json, noise
+from .mutate import mutated_bytes, mutated_json
 from .running import Case, check, peak_mb, reset_peak
-from .seeds import Seed, data_root, real_seeds, scan_files, synthetic_seeds
+from .seeds import Seed, data_root, real_seeds, synthetic_seeds
 
 LIMIT_S, LIMIT_MB = 65.0, 2700.0  # 60 s and 2 GiB of data for the process that decodes
 END_TO_END_EVERY = 1000
@@ -49,7 +48,7 @@ END_TO_END_EVERY = 1000
 FORKED_LIMIT_S, OSF_LIMIT_S = 0.2, 0.05
 MOST_SCANS = 20
 CAPTURES_OF_A_FORK = 50
-REAL_SHARE, FILE_SHARE = 0.1, 0.2
+REAL_SHARE = 0.1
 
 LIBRARIES = (
     "ouster.sdk.core", "ouster.sdk.osf", "velodyne_decoder", "lz4.frame", "zstandard", "sqlite3",
@@ -188,7 +187,6 @@ class Captures:
                     list(decode(entry, entry.suffix, None, None, lambda text: None, lambda: None))
         root = data_root()
         self.real = [] if root is None else real_seeds(root)
-        self.files = scan_files()
         self.process: Forked | None = None
         weights = {"ouster": 8, "velodyne": 3}
         self.weighted = [seed for seed in self.seeds for _ in range(weights.get(seed.kind, 1))]
@@ -198,8 +196,6 @@ class Captures:
         resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
 
     def run(self, case: Case) -> str:
-        if case.chance(FILE_SHARE):
-            return self.file(case)
         seed = case.pick(self.real) if self.real and case.chance(REAL_SHARE) else case.pick(self.weighted)
         files = DAMAGES[seed.kind](dict(seed.files), case, seed)
         for name, content in files.items():
@@ -244,22 +240,6 @@ class Captures:
             check(str(path) in str(exc) or path.name in str(exc), f"a message without the file's name: {exc}")
             return "PointsError" if n_scans == 0 else "scans, then PointsError"
         return "scans" if n_scans else "no scan"
-
-    def file(self, case: Case) -> str:
-        """A scan file, which is read in this process."""
-        name = case.pick([*self.files])
-        content = self.files[name]
-        content = mutated_bytes(content, case, 6, near=case.pick([0, 30, 250])) if case.chance(0.95) else noise(case)
-        case.evidence[name] = content
-        path = case.folder / name
-        path.write_bytes(content)
-        suffix = name.partition(".")[2]
-        options = {"columns": case.pick([3, 4, 5, 64, 65, 0, -1])} if case.chance(0.05) else {}
-        try:
-            check_scan(None, read_points(path, **options))
-        except PointsError:
-            return f"{suffix}: PointsError"
-        return f"{suffix}: scan"
 
 
 def check_scan(stamp_s: Any, points: Any) -> None:
