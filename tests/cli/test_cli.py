@@ -9,7 +9,6 @@ import os
 import shlex
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
-from test_pcap import as_pcapng, packets_in
 
 from checkout import printed
 from cli_helpers import OBJECTS, POINTSEG, SSADNET, Shell, parsers, run, thinned, write_scan
@@ -82,8 +80,6 @@ class FakePerceiver:
             raise InferenceError("pointseg answered\nwith NaN")
         if len(points) and points[0, 3] == 2.0:
             raise KeyboardInterrupt
-        if len(points) and points[0, 3] == 3.0:
-            warnings.warn("the scan has 32 beams", stacklevel=2)
         views = [card.view.kind for card in self.cards]
         labels = np.arange(len(points), dtype=np.uint8) % 2
         cells = np.zeros((400, 200), dtype=np.uint8)
@@ -355,19 +351,6 @@ def test_an_array_of_more_columns_takes_their_names(tmp_path: Path, shell: Shell
     assert answer["point_counts"] == first["point_counts"]
 
 
-def test_a_pcapng_is_read_as_a_pcap(tmp_path: Path, shell: Shell) -> None:
-    pytest.importorskip("velodyne_decoder")
-    path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2))
-    paths = [path, tmp_path / "little.pcapng", tmp_path / "big.pcapng"]
-    for each, order in zip(paths[1:], "<>", strict=True):
-        each.write_bytes(as_pcapng(packets_in(path.read_bytes()), order, 9))
-    answers = []
-    for each in paths:
-        answers.append([json.loads(line)["point_counts"] for line in shell.out("run", each, "--json").splitlines()])
-    assert answers[0] == answers[1] == answers[2] != []
-    assert "vlp-16" in shell.out("info", paths[2])
-
-
 def test_an_origin_that_cannot_be_found_fails_the_scan(tmp_path: Path, shell: Shell) -> None:
     said = shell.err("run", write_scan(tmp_path / "a.bin"), "--origin", "auto", code=1)
     assert "place of the sensor cannot be told" in said
@@ -570,17 +553,6 @@ def test_files_are_written(tmp_path: Path, shell: Shell) -> None:
     assert answer["n_points"] == 40
 
 
-def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
-    for k, folder in enumerate(("day1/velodyne", "day2/velodyne")):
-        write_scan(tmp_path / folder / "000.bin", 10 + k)
-        write_scan(tmp_path / folder / "001.bin", 20 + k)
-    out = tmp_path / "out"
-    folders = [tmp_path / "day1" / "velodyne", tmp_path / "day2" / ".." / "day2" / "velodyne"]
-    assert run("run", *folders, "--out", out, "--labels") == 0
-    sizes = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
-    assert sizes == {"day1/000.label": 10, "day1/001.label": 20, "day2/000.label": 11, "day2/001.label": 21}
-
-
 @pytest.mark.parametrize(
     ("given", "names"),
     [
@@ -592,6 +564,7 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
         (["/x/d/a.bin", "/y/d/a.bin", "/y/d/b.bin"], ["x/d/a", "y/d/a", "y/d/b"]),
         (["/a.bin", "/d/a.bin"], ["a", "d/a"]),
         (["/00/velodyne/a.bin", "/01/velodyne/a.bin"], ["00/a", "01/a"]),
+        (["/a/velodyne/0.bin", "/b/../b/velodyne/0.bin"], ["a/0", "b/0"]),
         (["/d/velodyne/a.bin", "/d/a.bin"], ["velodyne/a", "d/a"]),
         (["/d/.bin"], [".bin"]),
         (["/d/..bin"], ["..bin"]),
@@ -755,14 +728,6 @@ def test_interrupted(tmp_path: Path, shell: Shell) -> None:
     captured = shell.both("run", *scans, "--json", code=130)
     assert len(captured.out.splitlines()) == 1
     assert captured.err == "edgeperc: interrupted\n"
-
-
-@pytest.mark.filterwarnings("default::UserWarning")
-def test_warnings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = warnings.showwarning
-    assert run("run", write_scan(tmp_path / "a.bin", 40, first_remission=3.0)) == 0
-    assert capsys.readouterr().err == "edgeperc: warning: the scan has 32 beams\n"
-    assert warnings.showwarning is shown
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes are told of differently elsewhere")

@@ -115,7 +115,9 @@ def test_errors_and_warnings_are_one_line(capsys: pytest.CaptureFixture[str]) ->
 
     with warnings.catch_warnings():
         warnings.simplefilter("default")
+        shown = warnings.showwarning
         assert run_program("program", command) == 2
+        assert warnings.showwarning is shown
     captured = capsys.readouterr()
     assert captured.out == ""
     assert is_safe(captured.err)
