@@ -335,7 +335,6 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def test_run_reads_each_capture_as_its_sensor(
     tmp_path: Path, made: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("velodyne_decoder")
     for name, packets in (("a", velodyne(0x28)), ("b", velodyne(0x22)), ("c", velodyne(0)), ("d", velodyne(0x28))):
         write_pcap(tmp_path / f"{name}.pcap", packets)
     POINTS.tofile(tmp_path / "e.bin")
@@ -348,7 +347,6 @@ def test_run_reads_each_capture_as_its_sensor(
 
 @pytest.mark.filterwarnings("default:.*--sensor says:UserWarning")
 def test_run_believes_the_user(tmp_path: Path, made: list[Any], shell: Shell) -> None:
-    pytest.importorskip("velodyne_decoder")
     known, unknown = (write_pcap(tmp_path / f"{k}.pcap", velodyne(k)) for k in (0x22, 0))
     errors = shell.err("run", known, unknown, "--sensor", "os1-64", code=1)
     assert [get_sensor(sensor).name for sensor in made] == ["os1-64"]
@@ -358,7 +356,6 @@ def test_run_believes_the_user(tmp_path: Path, made: list[Any], shell: Shell) ->
 
 
 def test_info_tells_how_the_sensor_is_known(tmp_path: Path, shell: Shell) -> None:
-    pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
     (document,) = shell.records("info", path)  # all of it is as far away as the walls of a hall
     assert (document["sensor"], document["sensor_from"]) == ("vlp-16", "named by the packets")
@@ -378,21 +375,6 @@ def test_a_stream_warns_of_another_sensor(tmp_path: Path) -> None:
     path = write_pcap(tmp_path / "a.pcap", velodyne(0x22))
     with pytest.warns(UserWarning, match="the perceiver's sensor is hdl-64e, the capture names vlp-16"):
         stream(path, Perceiver()).close()
-
-
-@pytest.mark.parametrize(
-    ("name", "sensor"),
-    [
-        ("velodyne/sample_velodyne_hdl32.pcap", "hdl-32e"),
-        ("velodyne/sample_velodyne_vlp16_gps.pcap", "vlp-16"),
-        ("ouster/OS-0-128-U1_v2.3.0_1024x10.pcap", "os0-128"),
-        ("ouster/OS-1-64_1024x10_fw20.pcap", "os1-64"),
-    ],
-)
-def test_real_captures(data_root: Callable[[str], Path], name: str, sensor: str) -> None:
-    profile = sensor_of(data_root("other_sensors") / name)
-    assert profile.name == sensor
-    assert (profile is SENSORS[sensor]) == name.startswith("velodyne")
 
 
 def test_real_metadata(data_root: Callable[[str], Path]) -> None:

@@ -26,7 +26,6 @@ from edgeperc.simulation.samples import simulated_scan
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
 KINDS = [(1, False), (2, False), (3, False), (0x11, False), (0, True), (1, True), (2, True), (3, True), (4, True)]
-UNIT_M = {(2, False): 0.01}
 
 
 def scene(n: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -250,8 +250,6 @@ def test_several_sensors_in_one_capture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("other", ["velodyne", "pandarxt-16", "pandarxt-32"])
 def test_an_ouster_beside_another_makers_sensor_is_told_apart(tmp_path: Path, other: str) -> None:
-    if other == "velodyne":
-        pytest.importorskip("velodyne_decoder")
     payloads = vlp16_packets(2.0)[:110] if other == "velodyne" else other_packets(other)
     ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 2, 1) for packet in turn]
     sent = {"10.0.0.9": ("10.0.0.9", payloads), "122246000293": ("10.0.0.1:7502", ousters)}

@@ -108,7 +108,6 @@ def check_turns(path: Path, of_capture: Sequence[Any]) -> list[Any]:
 @pytest.mark.parametrize("writer", WRITERS)
 def test_packets_give_the_turns_of_a_capture(tmp_path: Path, writer: str, size: int) -> None:
     """However many of them the driver put into a message; with the clock of the messages."""
-    pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(2.5)
     of_capture = [*read_timed_scans(write_pcap(tmp_path / "a.pcap", packets))]
     path = WRITERS[writer](tmp_path, packets, size)
@@ -166,7 +165,6 @@ def test_damaged_messages(key: tuple[str, str], data: st.DataObject) -> None:
 
 
 def test_clouds_come_first_and_a_topic_chooses(tmp_path: Path) -> None:
-    pytest.importorskip("velodyne_decoder")
     store, sent = messages(pytest.importorskip("rosbags.typesys"), 2)
     clouds = [bytes(store.serialize_cdr(m, kind)) for _, kind, _, m in sent if kind.endswith("PointCloud2")]
     packets = split(vlp16_packets(1.2), 75, ros2_message)
@@ -208,7 +206,6 @@ def test_other_packets_are_named_with_what_to_do(kind: str, tmp_path: Path, shel
 
 
 def test_an_hdl64_in_a_bag_says_what_to_do(tmp_path: Path) -> None:
-    pytest.importorskip("velodyne_decoder")
     packets = velodyne(0x05, 0x48, [b"\xff\xee", b"\xff\xdd"])
     path = WRITERS["ROS 2"](tmp_path, packets, 75)
     with pytest.raises(PointsError, match=r"HDL-64E.*velodyne_pointcloud"):
@@ -222,7 +219,6 @@ def test_packets_that_do_not_name_their_model(tmp_path: Path) -> None:
 
 
 def test_the_scans_before_the_damage_come(tmp_path: Path) -> None:
-    pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(2.5)
     path = WRITERS["ROS 2"](tmp_path, packets, 75)
     path.write_bytes(path.read_bytes()[:-2000])

@@ -38,7 +38,6 @@ VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
 
 @pytest.mark.parametrize(("link", "head"), [*LINKS.items(), (1, VLAN)])
 def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> None:
-    pytest.importorskip("velodyne_decoder")
     path = write_link(tmp_path / "link.pcap", link, vlp16_packets(1.2), head)
     assert check_same(read_scans(path), read_scans(write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2)))) == 2
     assert sensor_of(path).name == "vlp-16"
@@ -66,8 +65,6 @@ def test_packets_that_were_not_kept_to_their_end_are_named(tmp_path: Path, kind:
 @pytest.mark.parametrize("link", [1, 113, 276])
 def test_packets_that_were_captured_twice_count_once(tmp_path: Path, kind: str, link: int) -> None:
     """As from a mirrored port, or ``tcpdump -i any`` beside a bridge."""
-    if kind == "velodyne":
-        pytest.importorskip("velodyne_decoder")
     path = write_link(tmp_path / "once.pcap", link, payloads_of(kind))
     expected = list(read_scans(path))
     path.write_bytes(pcap_head(link) + b"".join(each + each for each in records_of(path.read_bytes())))
@@ -94,8 +91,6 @@ def write_6(path: Path, payloads: Sequence[bytes], sender: str, most: int = 10_0
 @pytest.mark.parametrize("kind", ["velodyne", "hesai"])
 @pytest.mark.parametrize("most", [10_000, 600, 64])
 def test_packets_of_ipv6(tmp_path: Path, kind: str, most: int) -> None:
-    if kind == "velodyne":
-        pytest.importorskip("velodyne_decoder")
     expected = list(read_scans(write_link(tmp_path / "4.pcap", 1, payloads_of(kind))))
     one = write_6(tmp_path / "6.pcap", payloads_of(kind), "fe80::1", most)
     two = join(tmp_path / "two.pcap", [one, write_6(tmp_path / "b.pcap", payloads_of(kind), "fe80::2", most)])
@@ -114,7 +109,6 @@ def test_a_velodyne_in_fragments_or_with_bytes_behind(
     tmp_path: Path, link: int, head: bytes, first: int, behind: bytes
 ) -> None:
     """A narrow link divides packets after so many bytes; some cards capture the checksum of a frame, or padding."""
-    pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(1.2)
     content = pcap_head(link)
     for k, payload in enumerate(packets):
@@ -149,7 +143,6 @@ def test_an_ouster_behind_any_link(ouster: Path, tmp_path: Path, link: int) -> N
 )
 @pytest.mark.parametrize("link", [1, 113])
 def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tuple[str, ...]) -> None:
-    pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(1.2)
     path = write_link(tmp_path / "two.pcap", link, packets, **{f"sender_{k}": s for k, s in enumerate(senders)})
     assert Senders(path, lambda: None).velodynes == sorted(senders)
@@ -163,7 +156,6 @@ def test_several_velodynes_are_told_apart(tmp_path: Path, link: int, senders: tu
 
 @pytest.mark.parametrize(("link", "other"), [(1, "10.0.0.2"), (113, "10.0.0.1:2369"), (101, "10.0.0.2")])
 def test_a_velodyne_that_begins_late_is_told_apart(tmp_path: Path, link: int, other: str) -> None:
-    pytest.importorskip("velodyne_decoder")
     packets = vlp16_packets(30.0)
     path = write_link(tmp_path / "two.pcap", link, packets, begin=2100, one="10.0.0.1:2368", two=other)
     first, second = Senders(path, lambda: None).velodynes
@@ -183,7 +175,6 @@ def test_a_few_damaged_addresses_are_no_sensors(tmp_path: Path) -> None:
 def test_a_capture_is_counted_once(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever a topic is: before the first scan, packets are read once, but for the first ones and a sender's copy."""
     if name == "velodyne":
-        pytest.importorskip("velodyne_decoder")
         payloads = vlp16_packets(4.0) * 4
     else:
         payloads = packets_of(MODELS[name], blocks_of(MODELS[name], *ranges(MODELS[name], 1800))) * 5
@@ -210,7 +201,6 @@ def test_a_capture_is_counted_once(name: str, tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize("begin_us", [0, 3_599_700_000], ids=["hour", "turn of the hour"])
 @pytest.mark.parametrize("shift", [1, 3, 20])
 def test_packets_that_overtake_one_another_split_no_scan(tmp_path: Path, begin_us: int, shift: int) -> None:
-    pytest.importorskip("velodyne_decoder")
     content = [bytearray(packet) for packet in vlp16_packets(4.0)]
     for packet in content:
         (time_us,) = struct.unpack_from("<I", packet, 1200)

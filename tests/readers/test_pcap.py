@@ -5,15 +5,14 @@ from __future__ import annotations
 import io
 import shutil
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import check_same, records_of, vlp16_packets, write_link, write_pcap
+from capture_writers import check_same, records_of, vlp16_packets, write_link
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
 from test_captures import error_of, read_until_error
 from test_captures import ouster as ouster
 
@@ -231,7 +230,6 @@ def test_damaged_bytes(tmp_path: Path, order: str, places: list[tuple[int, bytes
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(("link", "name"), [(1, "drive.pcapng"), (113, "drive.PCAPNG"), (101, "drive.pcap")])
 def test_a_velodyne(tmp_path: Path, order: str, link: int, name: str) -> None:
-    pytest.importorskip("velodyne_decoder")
     source = write_link(tmp_path / "source.pcap", link, vlp16_packets(1.2))
     (tmp_path / "new").mkdir()
     path = tmp_path / "new" / name
@@ -252,20 +250,6 @@ def test_an_ouster(ouster: Path, tmp_path: Path) -> None:
     assert_same(path, ouster / "sphere.pcap")
 
 
-@pytest.mark.parametrize("name", ["pandar64", "rs-16", "helios-32", "rs-ruby-80"])
-def test_other_lidars(tmp_path: Path, name: str) -> None:
-    model = MODELS[name]
-    blocks = blocks_of(model, *ranges(model, 40 * model.blocks), first_deg=350.0)
-    angles = unit_angles(model)
-    says = [difop(model, angles)] if model.layout == ">" else []
-    source = write_pcap(tmp_path / "a.pcap", [*says, *packets_of(model, blocks)])
-    if model.layout == "<":
-        (tmp_path / "a.csv").write_text(calibration(angles))
-    path = tmp_path / "a.pcapng"
-    path.write_bytes(as_pcapng(packets_in(source.read_bytes())))
-    assert_same(path, source)
-
-
 def test_a_file_of_another_writer(capture: Path) -> None:
     dpkt = pytest.importorskip("dpkt.pcapng")
     stream, packets = io.BytesIO(), packets_in(capture.read_bytes())
@@ -276,27 +260,6 @@ def test_a_file_of_another_writer(capture: Path) -> None:
     ours = as_pcapng(packets, resolution=9)
     theirs = [(stamp_s, bytes(data)) for stamp_s, data in dpkt.Reader(io.BytesIO(ours))]
     assert [data for _, data in theirs] == [data for *_, data in packets]
-
-
-@pytest.mark.parametrize(
-    ("capture", "metadata"),
-    [
-        ("velodyne/sample_velodyne_hdl32", ""),
-        ("velodyne/sample_velodyne_vlp16_gps", ""),
-        ("ouster/OS-0-128-U1_v2.3.0_1024x10", "ouster/OS-0-128-U1_v2.3.0_1024x10"),
-        ("ouster/OS-1-64_1024x10_fw20", "ouster/OS-1-64_sensor_config_reduced"),
-    ],
-)
-def test_real_captures(data_root: Callable[[str], Path], tmp_path: Path, capture: str, metadata: str) -> None:
-    root = data_root("other_sensors")
-    if not metadata:
-        pytest.importorskip("velodyne_decoder")
-    source, path = tmp_path / "cap.pcap", tmp_path / "cap.pcapng"
-    shutil.copy(root / f"{capture}.pcap", source)
-    if metadata:
-        shutil.copy(root / f"{metadata}.json", tmp_path / "cap.json")
-    path.write_bytes(as_pcapng(packets_in(source.read_bytes()), ">", 9))
-    assert_same(path, source)
 
 
 def assert_same(path: Path, source: Path) -> None:

@@ -194,7 +194,6 @@ def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "rs-16", "helios-32"])
 def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: str) -> None:
-    pytest.importorskip("velodyne_decoder")
     model, angles = MODELS[name], unit_angles(MODELS[name])
     packets = packets_of(model, blocks_of(model, *ranges(model, 128)))
     if not name.startswith("pandar"):
