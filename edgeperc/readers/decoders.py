@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
@@ -14,7 +13,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
-from ..types.points import MapError, as_points, is_remission_name, table_columns
+from ..types.points import MapError, is_remission_name, table_columns
 from .alternation import told_apart
 from .bags import open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
@@ -35,9 +34,8 @@ from .packet_messages import (
 from .packets import (
     SNIFFED_PACKETS,
     Datagrams,
-    copy_as_ethernet,
-    is_plain,
     sender_names,
+    velodyne_captured,
     velodyne_name,
     velodyne_packets,
 )
@@ -190,7 +188,7 @@ def _chosen_reader(job: _Job, senders: Senders, is_velodyne: bool) -> Iterator[T
     topic = job.topic
     readers: list[tuple[Sequence[str], Callable[[str | None], Iterator[TimedScan]]]] = []
     if is_velodyne:
-        readers.append((senders.velodynes, lambda sender: _velodyne_scans(_decodable(job, sender, senders))))
+        readers.append((senders.velodynes, lambda sender: _velodyne_turns(job, sender)))
     if lidar := senders.lidar(topic):
         from .lidars import turns_of  # numba
 
@@ -214,18 +212,6 @@ def _check_unnamed(remission_field: str | None) -> None:
         )
 
 
-def _decodable(job: _Job, sender: str | None, senders: Senders) -> Path:
-    """The capture, or a copy of one sender's packets, whole, in their order and behind Ethernet's header."""
-    path = job.path
-    if sender is None and not senders.n_overtaken and is_plain(path):
-        return path
-    if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
-        raise PointsError("the temporary folder has no room for a copy whose packets begin with Ethernet's header")
-    target = Path(tempfile.mkdtemp()) / path.name
-    copy_as_ethernet(path, target, job.alive, sender)
-    return target
-
-
 def _open_osf(path: Path, topic: str | None) -> tuple[Any, int]:
     """The turns of all sensors in an .osf file, and which of the sensors a topic names."""
     osf = require("ouster.sdk.osf", "ouster", "Reading an Ouster capture", package="ouster-sdk")
@@ -234,15 +220,14 @@ def _open_osf(path: Path, topic: str | None) -> tuple[Any, int]:
     return frames, _choose("LiDAR", [str(info.sn) for info in frames.sensor_info], topic)
 
 
-def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
-    velodyne = require("velodyne_decoder", "velodyne", "Reading a Velodyne capture", package="velodyne-decoder")
-    config = velodyne.Config()
-    for stamp, points in velodyne.read_pcap(str(path), config):
-        scan = as_points(points[:, :4])
-        # After the first scan the decoder knows the model of the sensor.
-        if config.model is not None and config.model.name.startswith("HDL64E"):
-            scan[:, 3] /= 255.0
-        yield TimedScan(stamp.device, scan, stamp.device + points[:, 4].astype(np.float64))
+def _velodyne_turns(job: _Job, sender: str | None) -> Iterator[TimedScan]:
+    """The turns of a Velodyne, on its own clock."""
+    stream = VelodyneStream("device", "Reading a Velodyne capture")
+    if velodyne_name(next(velodyne_packets(job.path, sender))) == "hdl-64e":
+        stream.calibrate(packet for _, packet in velodyne_captured(job.path, job.alive, sender))
+    for stamp_s, packet in velodyne_captured(job.path, job.alive, sender):
+        yield from stream.add(stamp_s, packet)
+    yield from stream.end()
 
 
 def _ouster_turns(job: _Job) -> Iterator[TimedScan]:
@@ -328,7 +313,7 @@ def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
             if isinstance(message, VelodyneScan):
                 _check_unnamed(job.remission_field)
                 turns = turns if isinstance(turns, VelodyneStream) else VelodyneStream()
-                yield from turns.add(message)
+                yield from turns.add_message(message)
                 continue
             if isinstance(message, OusterPacket):
                 if not isinstance(turns, OusterMessages):

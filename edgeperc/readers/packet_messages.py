@@ -131,31 +131,56 @@ class OusterMessages:
 
 
 class VelodyneStream:
-    """Turns of a Velodyne from messages, which need not begin and end where a turn does."""
+    """Turns of a Velodyne from its packets.
 
-    def __init__(self) -> None:
-        self._velodyne = require(
-            "velodyne_decoder", "velodyne", "Reading a Velodyne's packets", package="velodyne-decoder"
-        )
+    clock : ``"device"``, the sensor's, or ``"host"``: of the computer that recorded a bag, as of all its messages.
+    purpose : the beginning of the error where the library is missing.
+    """
+
+    def __init__(self, clock: str = "host", purpose: str = "Reading a Velodyne's packets") -> None:
+        self._velodyne = require("velodyne_decoder", "velodyne", purpose, package="velodyne-decoder")
+        self._clock, self._brightest = clock, 1.0
         self._decoder = self._velodyne.StreamDecoder(self._velodyne.Config())
 
-    def add(self, message: VelodyneScan) -> Iterator[TimedScan]:
-        """The turns that end in a message."""
+    def calibrate(self, packets: Iterable[memoryview]) -> None:
+        """Take what each HDL-64E has of its own from its packets, which hold it byte by byte. Raises ValueError."""
+        try:
+            status = self._velodyne.hdl64e.read_status_info(packets)
+            if status["Calibration Time"] is None:
+                raise ValueError("Calibration info not available in the metadata")
+            said = self._velodyne.hdl64e.status_info_to_calib_dict(status)
+            if [laser["laser_id"] for laser in said["lasers"]] != [*range(64)]:
+                raise ValueError("Invalid calibration data")
+        except ValueError as exc:
+            raise ValueError(
+                f"Data is from a HDL-64E, but the exact model and calibration could not be determined: {exc}"
+            ) from exc
+        model = getattr(self._velodyne.Model, f"HDL64E_{status['Model']}")
+        calibration = self._velodyne.Calibration.from_string(json.dumps(said, default=str))  # JSON is YAML
+        self._decoder = self._velodyne.StreamDecoder(self._velodyne.Config(model=model, calibration=calibration))
+        self._brightest = 255.0  # as in KITTI's files
+
+    def add(self, stamp_s: float, packet: memoryview) -> Iterator[TimedScan]:
+        """The turn that ends in a packet, which came then."""
+        yield from self._turn(self._decoder.decode(stamp_s, packet))
+
+    def add_message(self, message: VelodyneScan) -> Iterator[TimedScan]:
+        """The turns that end in a message, which need not begin and end where a turn does."""
         if any(velodyne_name(packet) == "hdl-64e" for _, packet in message.packets[:1]):
             raise PointsError(
                 "the packets are of an HDL-64E, and each has a calibration of its own: play the bag through "
                 "velodyne_pointcloud, and record its sensor_msgs/PointCloud2"
             )
         for stamp_ns, packet in message.packets:
-            yield from self._turn(self._decoder.decode(1e-9 * stamp_ns, packet))
+            yield from self.add(1e-9 * stamp_ns, packet)
 
     def end(self) -> Iterator[TimedScan]:
         """The last turn, which may be a part."""
         yield from self._turn(self._decoder.finish())
 
-    @staticmethod
-    def _turn(decoded: Any) -> Iterator[TimedScan]:
+    def _turn(self, decoded: Any) -> Iterator[TimedScan]:
         if decoded is not None:
             stamp, points = decoded
-            # On the clock of the computer that recorded the bag, as all its messages.
-            yield TimedScan(stamp.host, as_points(points[:, :4]), stamp.host + points[:, 4].astype(np.float64))
+            stamp_s, scan = getattr(stamp, self._clock), as_points(points[:, :4])
+            scan[:, 3] /= self._brightest
+            yield TimedScan(stamp_s, scan, stamp_s + points[:, 4].astype(np.float64))

@@ -7,13 +7,12 @@ import ipaddress
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from .pcap import PCAP_MAGIC, CutShortError, is_ethernet, pcap_packets
+from .pcap import PCAP_MAGIC, CutShortError, pcap_packets
 
 LVX_MAGIC = b"livox_tech"
 """First bytes of Livox' own files."""
@@ -37,7 +36,6 @@ GPS_BYTES = 512  # of a Velodyne's packet with its position
 DIFOP = bytes.fromhex("a5ff005a11115555")
 """The first bytes of what RoboSense's sensors say of themselves."""
 _FLAG = b"\xff\xee"  # 0xEEFF, with which the first of twelve blocks begins
-_MOST_COPIED = 2048  # bytes of a datagram; a Velodyne's are shorter
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
 _PRODUCTS = {
@@ -52,7 +50,7 @@ _PRODUCTS = {
 _RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 
 # A packet that comes later than the next ones is at most so late, and so many wait for it.
-OVERTAKEN_S, _OVERTAKING = 0.05, 32
+_OVERTAKEN_S, _OVERTAKING = 0.05, 32
 _HOUR_S = 3600.0
 
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
@@ -176,10 +174,21 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
     datagrams = Datagrams(path, lambda: None, SNIFFED_PACKETS if sender is None else None)
     known = (each.payload for each in datagrams if is_of_velodyne(each) and each.is_from(sender))
     yield from islice(known, SNIFFED_PACKETS)
-    yield from _bare_velodyne_packets(path)
+    yield from (packet for _, packet in _bare_velodyne_packets(path, SNIFFED_PACKETS))
 
 
-def turned_s(datagram: Datagram, before_s: float) -> float:
+def velodyne_captured(path: Path, alive: Callable[[], None], sender: str | None) -> Iterator[tuple[float, memoryview]]:
+    """When each packet of a Velodyne, of a sender or all, was captured, and the packet, in the order of its clock."""
+    are_sent = False
+    for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):
+        if len(datagram.payload) == VELODYNE_BYTES:
+            are_sent = True
+            yield datagram.stamp_s, datagram.payload
+    if not are_sent:
+        yield from _bare_velodyne_packets(path)
+
+
+def _turned_s(datagram: Datagram, before_s: float) -> float:
     """The time of a Velodyne's packet, which begins anew each hour, as near to that of one before as it can be [s]."""
     now_s = 1e-6 * int.from_bytes(datagram.payload[1200:1204], "little")
     return before_s + (now_s - before_s + 0.5 * _HOUR_S) % _HOUR_S - 0.5 * _HOUR_S
@@ -192,8 +201,8 @@ def in_order(datagrams: Iterable[Datagram]) -> Iterator[Datagram]:
         if not is_of_velodyne(datagram):
             yield datagram
             continue
-        now_s = turned_s(datagram, latest_s)
-        if abs(now_s - latest_s) > OVERTAKEN_S:  # the clock was set
+        now_s = _turned_s(datagram, latest_s)
+        if abs(now_s - latest_s) > _OVERTAKEN_S:  # the clock was set
             yield from (each for *_, each in sorted(waiting))
             waiting = []
             latest_s = now_s
@@ -219,16 +228,16 @@ def is_of_velodyne(datagram: Datagram) -> bool:
     return len(datagram.payload) == VELODYNE_BYTES and bytes(datagram.payload[:2]) == _FLAG
 
 
-def _bare_velodyne_packets(path: Path) -> Iterator[memoryview]:
-    """Those among the first whose sender is not known, with whatever is in front of them."""
-    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS):
+def _bare_velodyne_packets(path: Path, most: int | None = None) -> Iterator[tuple[float, memoryview]]:
+    """When those among the first, or all, were captured whose sender is not known, and the packets."""
+    for link, stamp_s, packet in islice(pcap_packets(path, whole=False), most):
         if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == _FLAG:
             try:
                 at = _ip_at(packet, link)
             except ValueError:
                 at = None
             if at is None or len(packet) < at + 28 + VELODYNE_BYTES:
-                yield packet[-VELODYNE_BYTES:]
+                yield stamp_s, packet[-VELODYNE_BYTES:]
 
 
 def _ip_at(packet: memoryview, link: int) -> int | None:
@@ -281,44 +290,6 @@ def _fragment_6(packet: memoryview) -> _Fragment | None:
         return None
     source = bytes(packet[8:40]) + identification
     return _Fragment(source, packet[8:24], place & 0xFFF8, bool(place & 1), packet[begin:total])
-
-
-def is_plain(path: Path) -> bool:
-    """Whether a capture and its first packets are as the libraries that decode them expect.
-
-    They begin with Ethernet's header, and none is in fragments, there twice or of IPv6; the file is not a pcapng.
-    """
-    before: tuple[memoryview, ...] = ()
-    for link, _, packet in islice(pcap_packets(path, whole=False), SNIFFED_PACKETS):
-        with suppress(ValueError):
-            part = _fragment(packet, link)
-            if part is not None:
-                if part.more or part.start or len(part.sender) != 4:
-                    return False
-                if len(part.payload) > GPS_BYTES and (part.sender, part.payload) == before:
-                    return False
-                before = part.sender, part.payload
-    return is_ethernet(path)
-
-
-def copy_as_ethernet(path: Path, target: Path, alive: Callable[[], None], sender: str | None) -> None:
-    """Copy a Velodyne's datagrams in a pcap file, of one sender or all, in their order, each as one packet behind
-    Ethernet's header.
-
-    ``tcpdump -i any`` writes Linux's cooked headers; tunnels and phones write raw IP; a narrow link sends fragments.
-    """
-    with target.open("wb") as out:
-        out.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
-        for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):
-            size = len(datagram.payload)
-            if size > _MOST_COPIED:
-                continue
-            seconds, microseconds = divmod(round(1e6 * datagram.stamp_s), 10**6)
-            addresses = ipaddress.ip_address(datagram.sender).packed[-4:] + b"\xff" * 4
-            ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + size, 0, 0, 64, 17, 0) + addresses
-            udp = struct.pack(">HHHH", datagram.port, datagram.port, 8 + size, 0)
-            content = bytes(12) + b"\x08\x00" + ip + udp + datagram.payload
-            out.write(struct.pack("<IIII", seconds & 0xFFFFFFFF, microseconds, len(content), len(content)) + content)
 
 
 @lru_cache(maxsize=256)

@@ -68,22 +68,12 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[Captured]:
             ) from None
 
 
-def is_ethernet(path: Path) -> bool:
-    """Whether a file is a pcap, not a pcapng, of packets that begin with Ethernet's header."""
-    with path.open("rb") as file:
-        head = file.read(24)
-    return len(head) == 24 and head[:4] in _ORDERS and _link_type(head) == 1
-
-
-def _link_type(head: bytes) -> int:
-    return int(struct.unpack_from(f"{_ORDERS[head[:4]]}I", head, 20)[0]) & 0xFFFF
-
-
 def _of_records(data: memoryview) -> Iterator[Captured]:
     """The packets of a pcap file."""
-    head, size, at = bytes(data[:24]), len(data), 24
-    link, ticks = _link_type(head), 10**9 if b"\x4d" in head[:4] else 10**6
-    header = struct.Struct(f"{_ORDERS[head[:4]]}III4x")
+    size, at, magic = len(data), 24, bytes(data[:4])
+    order, ticks = _ORDERS[magic], 10**9 if b"\x4d" in magic else 10**6
+    link = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
+    header = struct.Struct(f"{order}III4x")
     while at < size:
         seconds, fraction, length = header.unpack_from(data, at) if at + 16 <= size else (0, 0, size)
         end = at + 16 + length

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import PointsError
 from .ouster import metadata_beside, read_metadata, reading
-from .packets import DIFOP, GPS_BYTES, OVERTAKEN_S, Datagrams, is_of_velodyne, sender_names, turned_s
+from .packets import DIFOP, GPS_BYTES, Datagrams, is_of_velodyne, sender_names
 
 if TYPE_CHECKING:
     from .ouster_packets import Layout
@@ -36,7 +36,6 @@ class Senders:
 
     names : of all LiDARs, with one for all Ousters.
     velodynes, ousters : those of Velodynes; serial numbers of Ousters, by the metadata beside the file.
-    n_overtaken : packets of Velodynes that come later than the next ones.
     n_packets, cut : packets that were looked at, and what is wrong where the file ends early.
 
     Raises PointsError: No packet was captured to its end.
@@ -50,15 +49,11 @@ class Senders:
             layouts = layouts_beside(path)
         sizes = set[int]()
         ouster_bytes = {layout.packet_bytes for layout in layouts}
-        self.n_overtaken, latest_s = 0, dict[tuple[str, int], float]()
         datagrams = Datagrams(path, alive, most)
         for datagram in datagrams:
             size, kind = len(datagram.payload), None
             if is_of_velodyne(datagram):
                 kind = _VELODYNE
-                before_s = latest_s.get((datagram.sender, datagram.port), -1.0)
-                latest_s[datagram.sender, datagram.port] = now_s = turned_s(datagram, before_s)
-                self.n_overtaken += -OVERTAKEN_S < now_s - before_s < 0.0
             elif size in ouster_bytes:
                 kind = _OUSTER
                 sizes.add(size)

@@ -345,22 +345,44 @@ def test_a_velodyne_capture(tmp_path: Path, endian: str) -> None:
     assert azimuth[-1] == pytest.approx(-3000 / 32 * 0.4, abs=1.0)
 
 
-def test_an_hdl_64e_is_scaled_as_kitti_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def hdl_64e_packets(n: int, calibration: bytes) -> list[bytes]:
+    """Packets whose last two bytes are, one after another, values of the state, then those of a calibration."""
+    state = [*zip(b"HMSDNYGTV", (1, 2, 3, 4, 5, 24, 0, 20, 7), strict=True)]
+    told = [state[k] if k < len(state) else (ord("1"), calibration[(k - len(state)) % 1820]) for k in range(n)]
+    return [
+        b"".join(
+            (b"\xff\xee", b"\xff\xdd")[block % 2]
+            + struct.pack("<H", (6 * k + block // 2) * 18 % 36000)
+            + struct.pack("<HB", 5000 + block, 51 + k % 7) * 32
+            for block in range(12)
+        )
+        + struct.pack("<IBB", 1_000_000 + 288 * k, *each)
+        for k, each in enumerate(told)
+    ]
+
+
+def test_an_hdl_64e_is_calibrated_and_scaled_as_kitti_is(tmp_path: Path) -> None:
+    """By what its packets tell of it, from anywhere in that, and as velodyne-decoder reads the file by itself."""
     velodyne = pytest.importorskip("velodyne_decoder")
-    path = write_pcap(tmp_path / "hdl64.pcap", vlp16_packets(0.1))
-
-    found: list[Any] = []
-
-    def read_pcap(file: str, config: Any) -> Iterator[Any]:
-        config.model = found[-1]
-        yield SimpleNamespace(device=1.0), np.full((2, 8), 51.0, np.float32)
-
-    monkeypatch.setattr(velodyne, "read_pcap", read_pcap)
-    for model, remission in ((velodyne.Model.HDL64E_S2, 0.2), (velodyne.Model.VLP32C, 51.0), (None, 51.0)):
-        found.append(model)
-        ((_, points, _),) = list(decode_here(path))
-        assert points[:, 3].tolist() == pytest.approx([remission] * 2)
-        assert points[0, :3].tolist() == [51.0] * 3
+    lasers = [struct.pack("<B9h2B", k, *range(9 * k, 9 * k + 7), 0, 0, 0, 255).ljust(28, b"\xff") for k in range(64)]
+    unknown = b"UNIT#" + bytes(2) + b"".join(lasers) + bytes(19) + struct.pack("<H", 1820)
+    known = unknown[:-28] + bytes([24, 5, 6, 7, 8, 9]) + unknown[-22:]  # when it was calibrated
+    path = write_pcap(tmp_path / "hdl64.pcap", hdl_64e_packets(1900, known[900:] + known[:900]))
+    scans = list(decode_here(path))
+    for (stamp, expected), (stamp_s, points, times_s) in zip(velodyne.read_pcap(str(path)), scans, strict=True):
+        assert stamp_s == stamp.device
+        np.testing.assert_array_equal(points[:, :3], expected[:, :3])
+        np.testing.assert_array_equal(points[:, 3], expected[:, 3] / np.float32(255.0))
+        np.testing.assert_array_equal(times_s, stamp.device + expected[:, 4].astype(np.float64))
+    assert len(scans) == 7
+    assert {*np.round(255.0 * scans[1][1][:, 3]).tolist()} == {*range(51, 58)}
+    for calibration, n, why in (
+        (known, 100, "Not enough metadata bytes in stream: 91 < 1820"),
+        (unknown, 1900, "Calibration info not available in the metadata"),
+        (known.replace(lasers[0], lasers[1], 1), 1900, "Invalid calibration data"),
+    ):
+        write_pcap(path, hdl_64e_packets(n, calibration))
+        assert f"exact model and calibration could not be determined: {why}" in error_of(path)
 
 
 def test_a_velodyne_capture_that_is_cut_short(tmp_path: Path) -> None:
