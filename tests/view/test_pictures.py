@@ -314,30 +314,26 @@ def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
     assert painted[60] == 0
 
 
-def test_ply_of_a_map_has_its_coordinates(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
-    origin = (512345.25, 5412345.5, 113.0)
-    write_ply(replace(perception, origin_m=origin), scan, tmp_path / "points.ply")
-    _, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
-    kinds = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("remission", "<f4"), ("colors", "u1", 4)]
-    rows = np.frombuffer(body, dtype=kinds)
-    for k, name in enumerate("xyz"):
-        np.testing.assert_array_equal(rows[name], scan[:, k].astype(np.float64) + origin[k])
-    np.testing.assert_allclose(read_points(tmp_path / "points.ply", origin_m=origin), scan, atol=1e-8)
-
-
-def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
-    write_ply(perception, scan, tmp_path / "points.ply")
-    header, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
-    kinds = {"float": "<f4", "uchar": "u1"}
+@pytest.mark.parametrize("origin", [None, (512345.25, 5412345.5, 113.0)])
+def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path: Path, origin: Any) -> None:
+    """The file of a scan in a map has its coordinates, as doubles."""
+    path = tmp_path / "points.ply"
+    write_ply(replace(perception, origin_m=origin), scan, path)
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    kinds = {"float": "<f4", "double": "<f8", "uchar": "u1"}
     properties = re.findall(r"property (\w+) (\w+)", header.decode("ascii"))
     rows = np.frombuffer(body, dtype=[(name, kinds[kind]) for kind, name in properties])
     assert rows.dtype.names == ("x", "y", "z", "remission", "label", "red", "green", "blue")
     assert len(rows) == len(scan)
-    for k, name in enumerate(("x", "y", "z", "remission")):
-        np.testing.assert_array_equal(rows[name], scan[:, k])
+    for k, name in enumerate("xyz"):
+        expected = scan[:, k] if origin is None else scan[:, k].astype(np.float64) + origin[k]
+        assert rows.dtype[name] == expected.dtype
+        np.testing.assert_array_equal(rows[name], expected)
+    np.testing.assert_array_equal(rows["remission"], scan[:, 3])
     np.testing.assert_array_equal(rows["label"], perception.points.labels)
     car = rows[rows["label"] == 1][0]
     assert "#{:02x}{:02x}{:02x}".format(*(car[c] for c in ("red", "green", "blue"))) == CLASS_COLORS["car"]
+    np.testing.assert_allclose(read_points(path, origin_m=origin), scan, atol=1e-8)
 
 
 def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path: Path) -> None:
