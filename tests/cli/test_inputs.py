@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
-import numpy as np
 import pytest
 from test_captures import vlp16_packets, write_pcap
 
 from cli_helpers import Shell, run, write_scan
-from edgeperc import PointsError, read_points, read_scans
+from edgeperc import PointsError, read_scans
 
 OF_RECORDINGS = ("--topic 10.0.0.1",)
 OF_SCAN_FILES = ("--columns x y z i", "--columns=x", "--origin 1 2 3", "--origin auto")
@@ -85,24 +83,6 @@ def test_packets_have_one_remission(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match=r"no field 'ambient' .* hold one remission"):
         next(read_scans(path, remission_field="ambient"))
     assert len(next(read_scans(path, remission_field="intensity"))[1])
-
-
-@pytest.mark.parametrize("suffix", ["npy", "ply", "pcd"])
-def test_names_of_columns_that_a_file_has_itself_are_not_taken_without_a_word(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"a.{suffix}"
-    if suffix == "npy":
-        np.save(path, np.zeros(3, [(name, "f4") for name in ("x", "y", "z", "i")]))
-    elif suffix == "ply":
-        names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "i"))
-        path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{names}end_header\n" + "0 0 0 0\n" * 3)
-    else:
-        head = "VERSION .7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
-        path.write_text(f"{head}DATA ascii\n" + "0 0 0 0\n" * 3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        read_points(path)
-    with pytest.warns(UserWarning, match=r"columns= \(--columns\) is not used: the file names its values, x, y, z, i"):
-        read_points(path, columns=("x", "y", "z", "ring"))
 
 
 def test_a_url_that_cannot_be_reached_is_named(shell: Shell) -> None:

@@ -110,9 +110,6 @@ def test_class_numbers() -> None:
     assert [class_number(name) for name in names] == [0, 0, 1, 1, 2, IGNORE, IGNORE]
     own = ("background", "van", "drivable")
     assert [class_number(name, own) for name in names] == [0, 2, IGNORE, 1, IGNORE, IGNORE, IGNORE]
-
-
-def test_class_numbers_of_the_surroundings() -> None:
     names = ["road", "drivable", "building", "static object", "background", "car", "fence"]
     assert [class_number(name) for name in names] == [0, 0, 0, 0, 0, 1, IGNORE]
     assert [class_number(name, SCENE_CLASSES) for name in names] == [
