@@ -331,15 +331,6 @@ def test_tracks_are_placed_in_the_map(tmp_path: Path, shell: Shell) -> None:
     assert np.linalg.norm(moved) == pytest.approx(1.6, abs=0.3)
 
 
-@pytest.mark.parametrize("origin", [["auto"], ["1", "2", "3"]], ids=" ".join)
-def test_an_origin_is_not_for_recordings(tmp_path: Path, shell: Shell, origin: list[str]) -> None:
-    pytest.importorskip("velodyne_decoder")
-    path = write_pcap(tmp_path / "a.pcap", vlp16_packets(1.5))
-    assert f"--origin is for scan files, and {path} is a recording" in shell.err("run", path, "--origin", *origin)
-    with pytest.raises(PointsError, match="the origin is that of scan files"):
-        next(captures.read_scans(path, origin_m=(1.0, 2.0, 3.0)))
-
-
 @pytest.mark.parametrize("names", [("x", "y", "z", "intensity", "ring"), ("ring", "z", "y", "x", "remission", "time")])
 def test_an_array_of_more_columns_takes_their_names(tmp_path: Path, shell: Shell, names: tuple[str, ...]) -> None:
     points = read_points(write_scan(tmp_path / "a.bin"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_captures import vlp16_packets, write_pcap
@@ -61,6 +62,8 @@ def test_an_option_of_no_use_is_refused(
     path = write_inputs(tmp_path)[kind]
     shown = " ".join(shell.err(command, path, *options.split()).split())
     assert (f"{said}{path}" if said.endswith("and ") else said) in shown
+    if said == " is for scan files, and ":
+        assert f"{path} is a recording; leave it out" in shown
     assert any(word.partition("=")[0] in shown for word in options.split() if word.startswith("--"))
 
 
@@ -70,11 +73,13 @@ def test_an_option_of_no_use_is_refused(
         ("scan file", {"topic": "10.0.0.1"}),
         ("folder", {"topic": "/points"}),
         ("recording", {"columns": ["x", "y", "z"]}),
+        ("recording", {"origin_m": (1.0, 2.0, 3.0)}),
     ],
 )
-def test_so_does_the_library(kind: str, options: dict[str, str], tmp_path: Path) -> None:
-    with pytest.raises(PointsError, match=r"topic \(--topic\) chooses|columns \(--columns\) are those of scan files"):
-        next(iter(read_scans(write_inputs(tmp_path)[kind], **options)))  # type: ignore[arg-type]
+def test_so_does_the_library(kind: str, options: dict[str, Any], tmp_path: Path) -> None:
+    said = r"topic \(--topic\) chooses|columns \(--columns\) are those of scan files|the origin is that of scan files"
+    with pytest.raises(PointsError, match=said):
+        next(iter(read_scans(write_inputs(tmp_path)[kind], **options)))
 
 
 def test_packets_have_one_remission(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from edgeperc.datasets.kitti import (
     read_labels,
 )
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold_of, in_split
-from edgeperc.errors import CalibrationError, OptionError, PointsError
+from edgeperc.errors import OptionError, PointsError
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc.types.geometry import draw_footprints, inside
@@ -75,13 +75,6 @@ def test_headings_turn_the_right_way(tmp_path: Path, calibration: KittiCalibrati
     ((box,), _) = objects(tmp_path, calibration, f"Car 0 0 0 0 0 0 0 1.5 1.6 4.0 0 1.65 20 {turn}")
     # KITTI's angle grows about the camera's y axis, which points down.
     assert math.cos(box.yaw - (-turn - math.pi / 2)) == pytest.approx(1.0)
-
-
-def test_a_calibration_that_is_none(tmp_path: Path) -> None:
-    path = tmp_path / "calib.txt"
-    path.write_text("P2: 1 2 3\n")
-    with pytest.raises(CalibrationError, match="R0_rect"):
-        KittiCalibration.read(path)
 
 
 def frame(calibration: KittiCalibration, points: np.ndarray, *boxes: Box, unlabeled: tuple = ()) -> Frame:
