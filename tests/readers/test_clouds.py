@@ -91,12 +91,12 @@ def part(number: int, value: int | bytes) -> bytes:
 
 
 def foxglove(points: np.ndarray, stamp: tuple[int, int] = (5, 7)) -> bytes:
-    data = np.asarray(points, "<f4").tobytes()
+    data = np.rec.fromarrays(points.T, "<f4, <f4, <f4, <f8").tobytes()
     fields = [part(1, name.encode()) + part(2, 4 * k) + part(3, 7) for k, name in enumerate("xyz")]
-    fields.append(part(1, b"intensity") + part(2, 12) + part(3, 7))
+    fields.append(part(1, b"intensity") + part(2, 12) + part(3, 8))
     pose = part(1, b"") + part(2, part(4, b""))
     head = part(1, part(1, stamp[0]) + part(2, stamp[1])) + part(2, b"lidar") + part(3, pose)
-    fixed = varint(4 << 3 | 5) + struct.pack("<I", 16)
+    fixed = varint(4 << 3 | 5) + struct.pack("<I", 20)
     return head + fixed + b"".join(part(5, field) for field in fields) + part(6, data)
 
 

@@ -34,9 +34,10 @@ from edgeperc.readers.senders import Senders
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
 VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
+MPLS = bytes(12) + b"\x88\x47\x00\x01\x01\x40"  # in which nobody looks for a sender
 
 
-@pytest.mark.parametrize(("link", "head"), [*LINKS.items(), (1, VLAN)])
+@pytest.mark.parametrize(("link", "head"), [*LINKS.items(), (1, VLAN), (1, MPLS)])
 def test_a_velodyne_behind_any_link(tmp_path: Path, link: int, head: bytes) -> None:
     path = write_link(tmp_path / "link.pcap", link, vlp16_packets(1.2), head)
     assert check_same(read_scans(path), read_scans(write_pcap(tmp_path / "a.pcap", vlp16_packets(1.2)))) == 2

@@ -141,6 +141,9 @@ def test_mcap_holds_what_went_in(tmp_path: Path, mounting: Mounting | None) -> N
     topics = read_mcap(tmp_path / "run.mcap")
     assert {*topics} == {"/points", "/boxes", "/tracks", "/drivable", "/status", "/tf"}
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+    for scan, (stamp_s, points) in zip(scans, read_scans(tmp_path / "run.mcap"), strict=True):
+        assert stamp_s == pytest.approx(scan.stamp_s)
+        np.testing.assert_array_equal(points, scan.points)
     for topic, messages in topics.items():
         assert [log_time for log_time, _, _ in messages] == [round(scan.stamp_s * 1e9) for scan in scans], topic
     for k, scan in enumerate(scans):
