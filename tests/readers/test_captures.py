@@ -385,15 +385,6 @@ def test_an_hdl_64e_is_calibrated_and_scaled_as_kitti_is(tmp_path: Path) -> None
         assert f"exact model and calibration could not be determined: {why}" in error_of(path)
 
 
-def test_a_velodyne_capture_that_is_cut_short(tmp_path: Path) -> None:
-    """What came before the cut is read; velodyne-decoder alone would say nothing."""
-    path = write_pcap(tmp_path / "cut.pcap", vlp16_packets(1.8))
-    path.write_bytes(path.read_bytes()[:-300])
-    scans, error = read_until_error(path)
-    assert len(scans) == 2
-    assert "the file ends inside packet 135" in error
-
-
 @pytest.fixture(scope="module")
 def ouster(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with sphere.pcap, its metadata and sphere.osf: three turns of 64 x 512, every other column empty."""
@@ -440,7 +431,7 @@ def test_an_ouster_capture_that_is_cut_short(ouster: Path, tmp_path: Path) -> No
     scans, error = read_until_error(path)
     assert len(scans) == 2
     assert len(scans[0][1]) == 64 * 256 > len(scans[1][1]) > 0
-    assert "cut short or damaged: the file ends inside packet" in error
+    assert "cut short or damaged: the file ends inside packet 58, at byte" in error
 
 
 def test_damaged_osf_is_refused_before_the_sdk_opens_it(ouster: Path, tmp_path: Path) -> None:

@@ -182,16 +182,6 @@ def test_calibrations_that_are_none(tmp_path: Path, text: str, n: int) -> None:
         spinning_packets.read_angles(path, spinning_packets.FORMATS["pandar40p"])
 
 
-def test_several_sensors_are_told_apart(tmp_path: Path) -> None:
-    model = MODELS["pandarxt-16"]
-    packets = packets_of(model, blocks_of(model, *ranges(model, 64)))
-    path = write_link(tmp_path / "two.pcap", 1, packets, one="10.0.0.1", two="10.0.0.2")
-    assert "expected one LiDAR, there are 10.0.0.1, 10.0.0.2; choose one" in error_of(path)
-    (scan,) = list(read_timed_scans(path, topic="10.0.0.2"))
-    (alone,) = list(read_timed_scans(write_link(tmp_path / "one.pcap", 113, packets)))
-    np.testing.assert_array_equal(scan.points, alone.points)
-
-
 @pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "rs-16", "helios-32"])
 def test_a_velodyne_beside_another_sensor_is_told_apart(tmp_path: Path, name: str) -> None:
     model, angles = MODELS[name], unit_angles(MODELS[name])
