@@ -56,7 +56,7 @@ def hostile_scan(case: Case) -> Any:
         if type(scan) is not np.ndarray or scan.dtype.kind not in "fiu" or scan.ndim != 2 or scan.shape[1] < 3:
             break  # to a subclass or a list, nothing more is done
         with np.errstate(all="ignore"):
-            scan = mutate(scan, case)
+            scan = mutate(scan.astype(np.float32) if mutate in IN_FLOAT32 else scan, case)
     return scan
 
 
@@ -137,7 +137,6 @@ def nan_bits(scan: Points, case: Case) -> Points:
 
 
 def extreme_coordinates(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     rows, signs = _rows(scan, case), case.rng.choice([-1.0, 1.0], 1)
     scan[rows, int(case.rng.integers(scan.shape[1]))] = (case.rng.choice(EXTREMES, len(rows)) * signs).astype(
         np.float32
@@ -162,7 +161,6 @@ def many_duplicates(scan: Points, case: Case) -> Points:
 
 def one_column(scan: Points, case: Case) -> Points:
     """Points above one another, or a constant coordinate."""
-    scan = scan.astype(np.float32)
     for k in case.rng.choice(3, int(case.rng.integers(1, 4)), replace=False):
         scan[:, k] = case.pick([0.0, 10.0, -1.73])
     return scan
@@ -170,7 +168,6 @@ def one_column(scan: Points, case: Case) -> Points:
 
 def lattice(scan: Points, case: Case) -> Points:
     step = np.float32(case.pick([0.05, 0.1, 0.4, 1.0, 10.0]))
-    scan = scan.astype(np.float32)
     scan[:, :3] = np.round(scan[:, :3] / step) * step
     return scan
 
@@ -183,26 +180,22 @@ def full_lattice(scan: Points, case: Case) -> Points:
 
 
 def millimeters(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, :3] *= np.float32(case.pick([1000.0, 100.0, 0.001, 1e-6, 3.28]))
     return scan
 
 
 def z_is_row(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, 2] = np.arange(len(scan)) % int(case.pick([16, 64, 1 << 30]))
     return scan
 
 
 def z_is_16_bits(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, 2] = case.rng.integers(0, 65536, len(scan))
     return scan
 
 
 def swapped_axes(scan: Points, case: Case) -> Points:
     order = case.rng.permutation(3)
-    scan = scan.astype(np.float32)
     scan[:, :3] = scan[:, :3][:, order] * case.pick([1, -1])
     return scan
 
@@ -307,26 +300,22 @@ def unaligned(scan: Points, case: Case) -> Points:
 
 
 def origin(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, :3] *= np.float32(case.pick([0.0, 1e-30, 1e-3]))
     return scan
 
 
 def one_pixel(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, :3] = np.float32([20.0, 0.0, -1.0]) * (1.0 + 1e-4 * case.rng.random((len(scan), 1)).astype(np.float32))
     return scan
 
 
 def behind(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, 0] = -np.abs(scan[:, 0])
     return scan
 
 
 def edges(scan: Points, case: Case) -> Points:
     """One unit in the last place beside the edges of cells and of the view."""
-    scan = scan.astype(np.float32)
     places = np.float32(case.pick([0.1, 0.4, 1.0])) * np.round(scan[:, :3] * 2.5)
     towards = np.float32(case.pick([-np.inf, np.inf]))
     scan[:, :3] = np.nextafter(places.astype(np.float32), towards)
@@ -335,7 +324,6 @@ def edges(scan: Points, case: Case) -> Points:
 
 def shell(scan: Points, case: Case) -> Points:
     """A sphere, a wall around, a ceiling: nothing that looks like a road."""
-    scan = scan.astype(np.float32)
     norm = np.maximum(np.linalg.norm(scan[:, :3].astype(np.float64), axis=1, keepdims=True), 1e-9)
     scan[:, :3] *= (10.0 / norm).astype(np.float32)
     if case.chance(0.3):
@@ -344,7 +332,6 @@ def shell(scan: Points, case: Case) -> Points:
 
 
 def sparse_far(scan: Points, case: Case) -> Points:
-    scan = scan.astype(np.float32)
     scan[:, :2] *= np.float32(10.0 ** case.rng.uniform(2, 37))
     return scan
 
@@ -360,6 +347,11 @@ MUTATIONS: list[Callable[[Points, Case], Any]] = [
     remissions, read_only, byte_swapped, memory_mapped, subclass, masked, objects, unaligned, origin, one_pixel, behind,
     edges, shell, sparse_far, from_buffer,
 ]  # fmt: skip
+IN_FLOAT32 = {
+    extreme_coordinates, one_column, lattice, millimeters, z_is_row, z_is_16_bits, swapped_axes, origin,
+    one_pixel, behind, edges, shell, sparse_far,
+}  # fmt: skip
+"""Those that change numbers in place, of a copy as float32."""
 
 
 def save(path: Path, scan: Any) -> bytes:
