@@ -169,7 +169,7 @@ def sender_names(counts: Mapping[tuple[str, int], int]) -> list[str]:
 def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryview]:
     """A Velodyne's packets among the first of a pcap file, or of a sender, of 1206 bytes each.
 
-    sender : one of `velodyne_senders`; None: all.
+    sender : one of `Senders.velodynes`; None: all.
     """
     datagrams = Datagrams(path, lambda: None, SNIFFED_PACKETS if sender is None else None)
     known = (each.payload for each in datagrams if is_of_velodyne(each) and each.is_from(sender))

@@ -230,12 +230,11 @@ class _Channels:
         self._log("/status", "", {name: value for name, value in status.items() if value is not None})
 
     def _fields(self, dtype: np.dtype[Any]) -> list[Any]:
-        make, fields, offset = self._messages, [], 0
-        for name in dtype.names or ():
-            number = getattr(make.PackedElementFieldNumericType, _TYPES[dtype[name].str])
-            fields.append(make.PackedElementField(name=name, offset=offset, type=number))
-            offset += int(dtype[name].itemsize)
-        return fields
+        make, kinds = self._messages, self._messages.PackedElementFieldNumericType
+        return [
+            make.PackedElementField(name=name, offset=offset, type=getattr(kinds, _TYPES[kind.str]))
+            for name, (kind, offset, *_) in (dtype.fields or {}).items()
+        ]
 
     def _vector(self, values: Any) -> Any:
         x, y, z = map(float, values)
