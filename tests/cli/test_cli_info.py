@@ -346,6 +346,8 @@ def test_info_prints_the_mounting_and_writes_a_profile(drive: Path, tmp_path: Pa
     assert mounting.height_m == pytest.approx(2.4, abs=0.1)
     assert replace(get_sensor(written), mounting=thinned().mounting) == thinned()
 
+    of_folder = shell.records("info", drive)[0]["mounting"]  # one scan shows no ground
+    assert (of_folder["n_scans"], of_folder["mounting"]["height_m"]) == (2, pytest.approx(2.4, abs=0.1))
     estimate = shell.records("info", drive / "0.bin", "--mount-height", "2.0")[0]["mounting"]
     assert (estimate["mounting"]["height_m"], estimate["height_sd_m"]) == (2.0, 0.0)
     assert estimate["roll_sd_deg"] > 0.0
@@ -359,12 +361,6 @@ def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, shell: Sh
     assert metadata.read_text() == '{"beam_altitude_angles": [1, 2]}'
     for _ in range(2):  # a profile replaces another
         assert run("info", drive / "0.bin", "--write", tmp_path / "mine.json") == 0
-
-
-def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, shell: Shell) -> None:
-    estimate = shell.records("info", drive)[0]["mounting"]
-    assert estimate["n_scans"] == 2
-    assert estimate["mounting"]["height_m"] == pytest.approx(2.4, abs=0.1)
 
 
 def test_no_profile_is_written_without_ground_or_of_two_sensors(drive: Path, tmp_path: Path, shell: Shell) -> None:

@@ -29,6 +29,7 @@ from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc.types.geometry import draw_footprints, inside
 from edgeperc.types.perception import Box
+from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.augment import augmented
 from edgeperc_export.data.roads import ground_plane, sure_surface
@@ -214,13 +215,14 @@ def test_a_mirrored_turned_scan_turned_and_mirrored_back(scan: LabeledScan) -> N
     assert back.turn == pytest.approx(0.0)
 
 
-def test_scans_are_stored_and_read_back(scan: LabeledScan, tmp_path: Path) -> None:
-    scan.save(tmp_path / "scan.npz")
+@pytest.mark.parametrize("sensor", [None, get_sensor("vlp-16")])
+def test_scans_are_stored_and_read_back(scan: LabeledScan, sensor: SensorProfile | None, tmp_path: Path) -> None:
+    replace(scan, sensor=sensor).save(tmp_path / "scan.npz")
     again = LabeledScan.load(tmp_path / "scan.npz")
     np.testing.assert_array_equal(again.points, scan.points)
     np.testing.assert_array_equal(again.labels, scan.labels)
     np.testing.assert_array_equal(again.surface, scan.surface)
-    assert again.counts == scan.counts
+    assert (again.counts, again.sensor) == (scan.counts, sensor)
     assert [b.label for b in again.boxes] == [b.label for b in scan.boxes]
     assert list(tmp_path.iterdir()) == [tmp_path / "scan.npz"]
 

@@ -41,7 +41,7 @@ from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import model_path
 from edgeperc_export.data.scan_sets import joined_hashes, read_scan_set, seen_by_network
-from edgeperc_export.data.scans import SURFACE, LabeledScan
+from edgeperc_export.data.scans import SURFACE
 from strategies import JSON
 
 BOXES = {"Car": "car", "Van": "van", "Rider": "ignore", "Cyclist": "cyclist", "Digger": "digger", "Cone": "background"}
@@ -774,13 +774,6 @@ def test_int8_is_calibrated_on_what_training_sees(tmp_path: Path) -> None:
     (scan,), _, _ = read_scan_set(ScanFolder(root), "train")
     projected = seen_by_network(make_projector(card.view, card.input), scan)[1]
     np.testing.assert_array_equal(image, projected.image)
-
-
-def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:
-    scan = LabeledScan.from_simulation(simulated_scan(3))
-    for sensor in (None, get_sensor("vlp-16")):
-        replace(scan, sensor=sensor).save(tmp_path / "scan.npz")
-        assert LabeledScan.load(tmp_path / "scan.npz").sensor == sensor
 
 
 def test_folders_are_evaluated(tmp_path: Path, shell: Shell) -> None:
