@@ -295,12 +295,6 @@ def test_bags_that_do_not_name_their_sensor(tmp_path: Path, write: Callable[[Pat
         sensor_of(path)
 
 
-def test_scan_files_do_not_name_their_sensor(tmp_path: Path) -> None:
-    POINTS.tofile(tmp_path / "a.bin")
-    assert sensor_of(tmp_path / "a.bin") is None
-    assert sensor_of(str(tmp_path)) is None
-
-
 def test_folders_of_captures(tmp_path: Path) -> None:
     for name in ("a.pcap", "b.pcap"):
         write_pcap(tmp_path / name, velodyne(0x28))
@@ -310,6 +304,7 @@ def test_folders_of_captures(tmp_path: Path) -> None:
         sensor_of(tmp_path)
     (tmp_path / "c.pcap").unlink()
     POINTS.tofile(tmp_path / "d.bin")
+    assert sensor_of(str(tmp_path / "d.bin")) is None  # which scan files do not name
     with pytest.raises(SensorError, match=r"several sensors \(scan files, vlp-32c\)"):
         sensor_of(tmp_path)
 
