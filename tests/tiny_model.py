@@ -67,8 +67,8 @@ HALF = node("Cast", "half", "x", field(5, field(1, b"to") + number(3, 1) + numbe
 
 
 def graph(*parts: bytes) -> bytes:
-    """Of the nodes and weights ``parts``; with `HALF` first, its input is in half precision."""
-    given = shaped("half", SHAPE, 10) if parts[0] is HALF else shaped("x", SHAPE)
+    """Of the nodes and weights ``parts``; with `HALF`, its input is in half precision."""
+    given = shaped("half", SHAPE, 10) if HALF in parts else shaped("x", SHAPE)
     return b"".join(parts) + field(2, b"g") + field(11, given) + field(12, shaped("y", SHAPE))
 
 
