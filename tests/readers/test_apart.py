@@ -417,6 +417,7 @@ def chunked_mcap(
         packed = pack(records, method)
         head = struct.pack("<QQQI", stamp_ns, stamp_ns, len(records), checksum)
         content += record(6, head + sized(method.encode()) + struct.pack("<Q", len(packed)) + packed)
+        content += record(7, struct.pack("<HI", 1, 0))  # where its messages are, which nobody needs
     return write_records(path, content, b"ros2", meta if summary else b"")
 
 
