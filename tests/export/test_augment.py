@@ -178,6 +178,15 @@ def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
     assert np.histogram(anywhere, bins=6, range=(0.0, 180.0))[0].min() >= 2
 
 
+def test_the_same_draw_gives_the_same_scan(scan: LabeledScan) -> None:
+    bank = augment.ObjectBank.of([scan])
+    how = augment.Augmentation(n_pasted=5.0, turn_to_rare=0.5, weather=0.5)
+    one, other = (augment.augmented(scan, np.random.default_rng(9), how, bank) for _ in range(2))
+    np.testing.assert_array_equal(one.points, other.points)
+    np.testing.assert_array_equal(one.labels, other.labels)
+    assert one.boxes == other.boxes
+
+
 def test_saved_scans_read_back(tmp_path: Path, scan: LabeledScan) -> None:
     scan.save(tmp_path / "scan.npz")
     back = LabeledScan.load(tmp_path / "scan.npz")
