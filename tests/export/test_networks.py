@@ -18,7 +18,7 @@ from edgeperc_export.networks import ssadnet
 from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.lodnn import EDGE_DILATIONS, LoDNN, LoDNNEdge
 from edgeperc_export.networks.pointpillars import PointPillars
-from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, PointSeg, SqueezeReweight
+from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
 from edgeperc_export.networks.resnets import N_BOX_VALUES, SFA3D, CENet, FIDNet, Residual
 from edgeperc_export.networks.salsanext import SalsaNext
 from edgeperc_export.networks.squeezesegv2 import ContextAggregation, KULSeg, SqueezeSegV2
@@ -80,6 +80,11 @@ def agree(actual: torch.Tensor, expected: torch.Tensor) -> None:
 def receptive_field(dilations: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
     """Width and height that a chain of 3x3 convolutions sees."""
     return tuple(1 + 2 * sum(along) for along in zip(*dilations, strict=True))
+
+
+def test_receptive_fields_follow_from_the_dilations() -> None:
+    assert list(ssadnet.CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
+    assert [receptive_field(ssadnet.CONTEXT_DILATIONS[:k]) for k in range(1, 8)] == [field for _, field in TABLE_1]
 
 
 @pytest.mark.parametrize("k", range(1, 8))
@@ -294,97 +299,52 @@ def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs() -> None:
 
 
 # Channels, and by how much the width has shrunk.
-
-
-# Channels of a module's output, and by how much its rows and columns have shrunk.
 POINTSEG_STAGES = {
-    "fire1": (64, 1, 2),
-    "fire3": (128, 1, 4),
-    "sr1": (128, 1, 4),
-    "sr2": (256, 1, 8),
-    "fire7": (384, 1, 16),
-    "sr3": (512, 1, 16),
-    "enlarge": (128, 1, 16),
-    "deconv1": (128, 1, 8),
-    "deconv1_enlarged": (128, 1, 8),
-    "deconv2": (128, 1, 4),
-    "deconv3": (64, 1, 2),
-    "deconv4": (64, 1, 1),
-    "skip1": (64, 1, 1),
+    "fire1": (64, 2),
+    "fire3": (128, 4),
+    "sr1": (128, 4),
+    "sr2": (256, 8),
+    "fire7": (384, 16),
+    "sr3": (512, 16),
+    "enlarge": (128, 16),
+    "deconv1": (128, 8),
+    "deconv1_enlarged": (128, 8),
+    "deconv2": (128, 4),
+    "deconv3": (64, 2),
+    "deconv4": (64, 1),
+    "skip1": (64, 1),
 }
 SQUEEZESEG_STAGES = {
-    "fire1": (64, 1, 2),
-    "context1": (64, 1, 2),
-    "fire2": (128, 1, 4),
-    "context2": (128, 1, 4),
-    "context3": (128, 1, 4),
-    "fire5": (256, 1, 8),
-    "fire7": (384, 1, 16),
-    "fire7b": (384, 1, 16),
-    "fire9": (512, 1, 16),
-    "deconv10": (256, 1, 8),
-    "deconv11": (128, 1, 4),
-    "deconv12": (64, 1, 2),
-    "deconv13": (64, 1, 1),
-    "skip1": (64, 1, 1),
+    "fire1": (64, 2),
+    "context1": (64, 2),
+    "fire2": (128, 4),
+    "context2": (128, 4),
+    "context3": (128, 4),
+    "fire5": (256, 8),
+    "fire7": (384, 16),
+    "fire7b": (384, 16),
+    "fire9": (512, 16),
+    "deconv10": (256, 8),
+    "deconv11": (128, 4),
+    "deconv12": (64, 2),
+    "deconv13": (64, 1),
+    "skip1": (64, 1),
 }
-SALSANEXT_STAGES = {
-    "context": (32, 1, 1),
-    "encoders.0": (64, 1, 1),
-    "encoders.4": (256, 16, 16),
-    "decoders.0": (128, 8, 8),
-}
-RESNET_STAGES = {f"stages.{k}": (128, 2**k, 2**k) for k in range(4)}
 
 
+@pytest.mark.parametrize("width", [512, 2048])
 @pytest.mark.parametrize(
-    ("make", "channels", "sizes", "stages", "outputs"),
-    [
-        (PointSeg, 5, [(64, 512), (64, 2048)], POINTSEG_STAGES, [(4, 1)]),
-        (SqueezeSegV2, 5, [(64, 512), (64, 2048)], SQUEEZESEG_STAGES, [(4, 1)]),
-        (KULSeg, 5, [(64, 512), (64, 2048)], SQUEEZESEG_STAGES, [(4, 1)]),
-        # Networks that are only measured against
-        (SalsaNext, 5, [(64, 2048), (64, 512), (32, 1024), (16, 16)], SALSANEXT_STAGES, [(20, 1)]),
-        (FIDNet, 5, [(64, 2048), (64, 512), (40, 90)], {"stem": (512, 1, 1), **RESNET_STAGES}, [(20, 1)]),
-        (CENet, 5, [(64, 2048), (64, 512), (40, 90)], {"stem": (128, 1, 1), **RESNET_STAGES}, [(20, 1)]),
-        (
-            PointPillars,  # two anchors at half of the resolution
-            64,
-            [(496, 432), (248, 216), (8, 16)],
-            {"blocks.2": (256, 8, 8), "ups.2": (128, 2, 2)},
-            [(2, 2), (14, 2), (4, 2)],
-        ),
-        (
-            SFA3D,  # five heads at a quarter of it
-            3,
-            [(608, 608), (64, 96), (32, 32)],
-            {"stages.3": (512, 32, 32)},
-            [(n, 4) for n in N_BOX_VALUES.values()],
-        ),
-    ],
+    ("make", "stages"), [(PointSeg, POINTSEG_STAGES), (SqueezeSegV2, SQUEEZESEG_STAGES), (KULSeg, SQUEEZESEG_STAGES)]
 )
-def test_stages_have_the_described_channels_and_sizes(
-    make: Callable[[], torch.nn.Module],
-    channels: int,
-    sizes: list[tuple[int, int]],
-    stages: dict[str, tuple[int, int, int]],
-    outputs: list[tuple[int, int]],
+def test_networks_of_range_images_halve_only_the_width(
+    make: Callable[[], torch.nn.Module], stages: dict[str, tuple[int, int]], width: int
 ) -> None:
-    fused = ["head"] if make in (FIDNet, CENet) else []
-    levels = {f"heads.0.levels.{k}": shrink for k, shrink in enumerate((8, 4, 4))} if make is SFA3D else {}
-    network = on_meta(make)
-    for height, width in sizes:
-        image = torch.empty(2, channels, height, width, device="meta")
-        made, recorded = run_and_record(network, image, *stages, *levels, *fused)
-        for name, (n, down, across) in stages.items():
-            assert tuple(recorded[name][1].shape) == (2, n, -(-height // down), -(-width // across)), name
-        assert {name: height // recorded[name][0].shape[2] for name in levels} == levels
-        if fused:  # five resolutions
-            assert tuple(recorded["head"][0].shape) == (2, stages["stem"][0] + 512, height, width)
-        if "enlarge" in stages:
-            assert recorded["enlarge"][0].shape[2:] == (64, width // 16)
-        made = made if isinstance(made, tuple) else (made,)
-        assert [tuple(each.shape) for each in made] == [(2, n, height // by, width // by) for n, by in outputs]
+    logits, recorded = run_and_record(on_meta(make), torch.empty(2, 5, 64, width, device="meta"), *stages)
+    for name, (channels, shrink) in stages.items():
+        assert tuple(recorded[name][1].shape) == (2, channels, 64, width // shrink), name
+    assert logits.shape == (2, 4, 64, width)
+    if "enlarge" in stages:
+        assert recorded["enlarge"][0].shape[2:] == (64, width // 16)
 
 
 @pytest.mark.parametrize(("make", "n", "width"), [(PointSeg, 4, 256), (KULSeg, 3, 128)])
@@ -396,21 +356,29 @@ def test_networks_of_range_images_accept_other_sizes(make: Callable[..., torch.n
         assert logits.isfinite().all()
 
 
-@pytest.mark.parametrize(("layer", "n"), [(SqueezeReweight, 8), (ContextAggregation, 32)])
-def test_layers_scale_channels_by_what_is_around(layer: Callable[[int], torch.nn.Module], n: int) -> None:
-    """PointSeg's by the mean of the image (equations 3 and 4), SqueezeSegV2's by the maximum in 7 x 7 pixels."""
-    scaling, x = layer(n), torch.randn(3, n, 9, 11)
+def test_fire_layers_squeeze_to_a_quarter() -> None:
+    layers = {name: m for name, m in PointSeg().named_modules() if isinstance(m, Fire)}
+    assert [name for name, m in layers.items() if type(m) is Fire] == [f"fire{i}" for i in range(2, 10)]
+    assert sum(isinstance(m, FireDeconv) for m in layers.values()) == 5
+    for layer in layers.values():
+        squeeze, expand1, expand3 = layer.squeeze[0], layer.expand1[0], layer.expand3[0]
+        assert squeeze.out_channels == squeeze.in_channels // 4 == expand1.in_channels == expand3.in_channels
+        assert (squeeze.kernel_size, expand1.kernel_size, expand3.kernel_size) == ((1, 1), (1, 1), (3, 3))
+        assert expand1.out_channels == expand3.out_channels
+
+
+def test_squeeze_reweighting_is_equations_3_and_4() -> None:
+    layer = SqueezeReweight(8)
+    x = torch.randn(3, 8, 5, 7)
     with torch.no_grad():
-        actual = scaling(x).numpy()
-        w1, b1, w2, b2 = (parameter.squeeze().double().numpy() for parameter in scaling.parameters())
-    assert w1.shape == (2, n)  # a quarter, and a sixteenth
-    for sample, y in zip(x.double().numpy(), actual, strict=True):
-        for row, col in np.ndindex(9, 11):
-            around = sample.mean((1, 2))
-            if layer is ContextAggregation:
-                around = sample[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4].max((1, 2))
-            scale = 1.0 / (1.0 + np.exp(-(w2 @ np.maximum(w1 @ around + b1, 0.0) + b2)))
-            np.testing.assert_allclose(y[:, row, col], sample[:, row, col] * scale, rtol=1e-5)
+        actual = layer(x).numpy()
+        w1, b1, w2, b2 = (parameter.squeeze().double().numpy() for parameter in layer.parameters())
+    p = x.double().numpy()
+    assert w1.shape == (2, 8)
+    for sample, y in zip(p, actual, strict=True):
+        chi = np.array([sample[n].sum() / (5 * 7) for n in range(8)])  # equation 3
+        scale = 1.0 / (1.0 + np.exp(-(w2 @ np.maximum(w1 @ chi + b1, 0.0) + b2)))
+        np.testing.assert_allclose(y, sample * scale[:, None, None], rtol=1e-5)  # equation 4
 
 
 def test_enlargement_has_five_scales() -> None:
@@ -461,6 +429,56 @@ def test_kulseg_is_squeezesegv2_with_a_fire_7b() -> None:
     assert not torch.equal(recorded["fire7b"][1], recorded["fire7"][1])
     _, recorded = run_and_record(SqueezeSegV2().eval(), x, "fire7", "fire8")
     assert recorded["fire8"][0] is recorded["fire7"][1]
+
+
+def test_squeezesegv2_squeezes_as_squeezeseg_does() -> None:
+    layers = {name: m for name, m in KULSeg().named_modules() if isinstance(m, Fire)}
+    widths = {
+        "fire2": (64, 16, 128),
+        "fire3": (128, 16, 128),
+        "fire4": (128, 32, 256),
+        "fire5": (256, 32, 256),
+        "fire6": (256, 48, 384),
+        "fire7": (384, 48, 384),
+        "fire8": (384, 64, 512),
+        "fire9": (512, 64, 512),
+        "deconv10": (512, 64, 256),
+        "deconv11": (256, 32, 128),
+        "deconv12": (128, 16, 64),
+        "deconv13": (64, 16, 64),
+        "fire7b": (384, 48, 384),
+    }
+    assert {
+        name: (m.squeeze[0].in_channels, m.squeeze[0].out_channels, m.expand1[0].out_channels * 2)
+        for name, m in layers.items()
+    } == widths
+
+
+def test_context_aggregation_scales_by_the_maximum_around() -> None:
+    layer = ContextAggregation(32)
+    x = torch.randn(2, 32, 9, 11)
+    with torch.no_grad():
+        actual = layer(x).numpy()
+        w1, b1, w2, b2 = (parameter.squeeze().double().numpy() for parameter in layer.parameters())
+    assert w1.shape == (2, 32)  # a sixteenth
+    for sample, y in zip(x.double().numpy(), actual, strict=True):
+        for row, col in np.ndindex(9, 11):
+            around = sample[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4].max((1, 2))
+            scale = 1.0 / (1.0 + np.exp(-(w2 @ np.maximum(w1 @ around + b1, 0.0) + b2)))
+            np.testing.assert_allclose(y[:, row, col], sample[:, row, col] * scale, rtol=1e-4, atol=1e-6)
+
+
+def test_context_aggregation_sees_7_by_7() -> None:
+    layer = ContextAggregation(16)
+    for parameter in layer.parameters():
+        nn.init.constant_(parameter, 0.1)
+    flat = torch.ones(1, 16, 15, 17)
+    peaked = flat.clone()
+    peaked[0, 0, 7, 8] = 3.0
+    with torch.no_grad():
+        rows, cols = torch.nonzero((layer(peaked) - layer(flat))[0, 1], as_tuple=True)
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (4, 10, 5, 11)
+    assert len(rows) == 49
 
 
 def test_squeezesegv2_gets_the_mask_of_returns() -> None:
@@ -586,6 +604,43 @@ def test_lodnn_edge_is_a_shortcut_before_training() -> None:
     assert logits.abs().max() < 1.0
 
 
+# networks that are only measured against
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (32, 1024), (16, 16)])
+def test_salsanext_labels_every_pixel(height: int, width: int) -> None:
+    stages = {"context": (32, 1), "encoders.0": (64, 1), "encoders.4": (256, 16), "decoders.0": (128, 8)}
+    image = torch.empty(2, 5, height, width, device="meta")
+    logits, recorded = run_and_record(on_meta(SalsaNext), image, *stages)
+    for name, (channels, shrink) in stages.items():
+        assert tuple(recorded[name][1].shape) == (2, channels, height // shrink, width // shrink), name
+    assert logits.shape == (2, 20, height, width)
+
+
+@pytest.mark.parametrize(("height", "width"), [(496, 432), (248, 216), (8, 16)])
+def test_pointpillars_has_two_anchors_at_half_resolution(height: int, width: int) -> None:
+    image = torch.empty(1, 64, height, width, device="meta")
+    outputs, recorded = run_and_record(on_meta(PointPillars), image, "blocks.2", "ups.2")
+    assert tuple(recorded["blocks.2"][1].shape) == (1, 256, height // 8, width // 8)
+    assert tuple(recorded["ups.2"][1].shape) == (1, 128, height // 2, width // 2)
+    assert [tuple(output.shape) for output in outputs] == [(1, n, height // 2, width // 2) for n in (2, 14, 4)]
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (40, 90)])
+@pytest.mark.parametrize(("make", "stem", "fused"), [(FIDNet, 512, 1024), (CENet, 128, 640)])
+def test_fidnet_and_cenet_fuse_five_resolutions(
+    make: Callable[[], torch.nn.Module], stem: int, fused: int, height: int, width: int
+) -> None:
+    names = ["stem", *(f"stages.{k}" for k in range(4)), "head"]
+    logits, recorded = run_and_record(on_meta(make), torch.empty(2, 5, height, width, device="meta"), *names)
+    assert tuple(recorded["stem"][1].shape) == (2, stem, height, width)
+    for k in range(4):
+        expected = (2, 128, -(-height // 2**k), -(-width // 2**k))
+        assert tuple(recorded[f"stages.{k}"][1].shape) == expected
+    assert tuple(recorded["head"][0].shape) == (2, fused, height, width)
+    assert logits.shape == (2, 20, height, width)
+
+
 @pytest.mark.parametrize(("c_in", "c_out", "stride"), [(8, 8, 1), (8, 4, 1), (8, 8, 2), (4, 16, 2)])
 def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> None:
     block, x = Residual(c_in, c_out, stride, nn.ReLU).eval(), torch.randn(2, c_in, 7, 9)
@@ -593,6 +648,18 @@ def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> 
     with torch.no_grad():
         agree(block(x), block.shortcut(x).relu())
     assert (len(block.shortcut) == 0) == (c_in == c_out and stride == 1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(608, 608), (64, 96), (32, 32)])
+def test_sfa3d_has_five_heads_at_a_quarter_of_the_resolution(height: int, width: int) -> None:
+    image = torch.empty(1, 3, height, width, device="meta")
+    outputs, recorded = run_and_record(on_meta(SFA3D), image, "stages.3", *(f"heads.0.levels.{k}" for k in range(3)))
+    assert tuple(recorded["stages.3"][1].shape) == (1, 512, height // 32, width // 32)
+    shrinks = {f"heads.0.levels.{k}": shrink for k, shrink in enumerate((8, 4, 4))}
+    assert {name: height // recorded[name][0].shape[2] for name in shrinks} == shrinks
+    assert [tuple(output.shape) for output in outputs] == [
+        (1, n, height // 4, width // 4) for n in N_BOX_VALUES.values()
+    ]
 
 
 @pytest.mark.parametrize("size", [32, 64, 96])
