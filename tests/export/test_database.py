@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -101,7 +103,7 @@ def test_a_picture_of_any_points_equals_its_twin(points: np.ndarray) -> None:
 
 
 def test_meters_are_rounded_and_clamped() -> None:
-    """Section 3.1: round to the nearest pixel, then clamp to 0..399 and 0..199; the highest point wins a pixel."""
+    """Section 3.1: round to the nearest pixel, then clamp to 0..399 and 0..199."""
     for (x, y), (row, col) in {
         (6.04, 0.0): (399, 99), (6.06, 0.0): (398, 99), (45.94, 0.0): (0, 99), (46.0, 0.0): (0, 99),
         (20.0, 10.0): (259, 0), (20.0, 9.94): (259, 0), (20.0, -10.0): (259, 199), (20.0, -9.94): (259, 198),
@@ -109,10 +111,14 @@ def test_meters_are_rounded_and_clamped() -> None:
         image = picture(np.array([[x, y, 0.0, 0.5]], np.float32))
         assert np.argwhere(image[..., 0]).tolist() == [[row, col]], (x, y)
         assert image[row, col].tolist() == [round(255 * np.hypot(x, y) / np.hypot(46, 10)), 128, 128]
-    outside = np.array([[5.99, 0, 0, 1], [46.01, 0, 0, 1], [20, 0, 2.6, 1], [20, 10.1, 0, 1]], np.float32)
-    assert not picture(outside).any()
-    stacked = np.array([[20, 0, -1, 0.1], [20, 0, 1, 0.2], [20, 0, 1, 0.3], [20, 0, 0, 0.4]], np.float32)
-    assert picture(stacked)[259, 99, 2] == round(255 * 0.2)  # the first of equally high ones
+    assert not picture(
+        np.array([[5.99, 0, 0, 1], [46.01, 0, 0, 1], [20, 0, 2.6, 1], [20, 10.1, 0, 1]], np.float32)
+    ).any()
+
+
+def test_the_highest_point_wins_and_the_first_of_equals() -> None:
+    points = np.array([[20, 0, -1, 0.1], [20, 0, 1, 0.2], [20, 0, 1, 0.3], [20, 0, 0, 0.4]], np.float32)
+    assert picture(points)[259, 99, 2] == round(255 * 0.2)
 
 
 def test_a_card_with_the_databases_view_has_its_cells() -> None:
@@ -200,13 +206,16 @@ def test_labels_match_the_map(out: Path) -> None:
     assert {*kinds} == {"car", "van", "truck"}
 
 
-def test_vehicles_in_view_are_kept_and_impossible_ones_named() -> None:
+@pytest.mark.parametrize("size", [(0.0, 2.0, 1.0), (4.0, float("nan"), 1.0), (4.0, 1e9, 1.0)])
+def test_an_impossible_vehicle_is_named(size: tuple[float, float, float]) -> None:
+    with pytest.raises(DatabaseError, match="a van is"):
+        vehicles([Box("van", 1.0, (20.0, 0.0, 0.0), size, 0.0)])
+
+
+def test_pedestrians_and_vehicles_out_of_view_are_left_out() -> None:
     seen = Box("car", 1.0, (20.0, 0.0, -1.0), (4.0, 1.8, 1.5), 0.3)
     boxes = [seen, replace(seen, label="pedestrian"), replace(seen, center=(80.0, 0.0, 0.0))]
     assert [b.label for b in vehicles(boxes)] == ["car"]
-    for size in ((0.0, 2.0, 1.0), (4.0, float("nan"), 1.0), (4.0, 1e9, 1.0)):
-        with pytest.raises(DatabaseError, match="a van is"):
-            vehicles([replace(seen, label="van", size=size)])
 
 
 def test_three_folders_with_equal_names_and_an_index(out: Path, kitti: Path) -> None:
@@ -356,50 +365,19 @@ def test_wrong_usage_of_the_reader_is_explained(out: Path, tmp_path: Path) -> No
             TopViewDatabase(tmp_path / "copy")
 
 
-def build_command(kitti: Path, target: Path, model: str, polygons: Path, *more: str) -> list[str]:
-    """A build in two processes."""
-    command = [sys.executable, "-m", "edgeperc_export.cli", "database-build", str(kitti), str(target), *more]
-    return [*command, "--workers", "2", "--road-by", model, "--variations", "3", "--polygons", str(polygons)]
+def test_processes_make_the_same_files(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
+    build(plan_of(kitti, tmp_path / "out", model), polygons=[polygons], workers=2)
+    assert contents(tmp_path / "out") == contents(out)
 
 
 def test_ray_makes_the_same_files(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    command = build_command(kitti, tmp_path / "out", model, polygons, "--engine", "ray")
+    command = [sys.executable, "-m", "edgeperc_export.cli", "database-build", str(kitti), str(tmp_path / "out")]
+    command += ["--engine", "ray", "--workers", "2", "--road-by", model]
+    command += ["--variations", "3", "--polygons", str(polygons)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert contents(tmp_path / "out") == contents(out)
-
-
-def test_a_killed_build_ends_its_workers_and_is_resumed(
-    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path
-) -> None:
-    """A surviving worker would write into a database that is being resumed."""
-    if not Path("/proc/self/stat").exists():
-        pytest.skip("needs /proc to see processes")
-    command = build_command(kitti, tmp_path / "out", model, polygons)
-    records = tmp_path / "out/.build/records"
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
-        children: list[int] = []
-        while process.poll() is None and (len(children) < 2 or len([*records.glob("*.json")]) < 3):
-            pids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-            children = [int(pid) for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-        process.kill()
-    assert children
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and any(map(alive, children)):
-        time.sleep(0.05)
-    assert not any(map(alive, children))
-    n_kept = len([*records.glob("*.json")])
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert f"{8 - n_kept} made, {n_kept} kept" in done.stdout, done.stderr
-    assert contents(tmp_path / "out") == contents(out)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Path) -> None:
@@ -467,6 +445,74 @@ def test_a_build_stopped_at_every_write_and_resumed_is_the_same(
             assert stops < 60
     assert stops >= 7
     assert contents(plan.out) == contents(out)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from edgeperc.system.atomic import write_atomic
+from edgeperc_export.database import build as build_module, scenes
+
+def announced(path, content):
+    print(path.name, flush=True)
+    write_atomic(path, content)
+
+build_module.write_atomic = scenes.write_atomic = announced
+kitti, out, model, polygons = sys.argv[1:]
+print("ready", flush=True)
+plan = scenes.Plan(Path(kitti), Path(out), model, provider="cpu", variations=3)
+build_module.build(plan, polygons=[Path(polygons)], workers=1)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal on this platform")
+def test_a_build_killed_twice_and_resumed_is_the_same(
+    out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path
+) -> None:
+    """At random moments: while the model is loaded, or after a random number of writes and a short delay."""
+    target, rng = tmp_path / "out", random.Random()
+    command = [sys.executable, "-c", KILLED, *map(str, (kitti, target, model, polygons))]
+    kills, finished = 0, []
+    while kills < 2:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+            for _ in range(rng.randint(1, 9)):  # at most eight writes of more than forty
+                assert process.stdout.readline()
+            time.sleep(rng.uniform(0.0, 0.005))
+            process.kill()
+            kills += process.wait() == -signal.SIGKILL
+        finished.append(len([*target.glob(".build/records/*.json")]))
+        for path in target.rglob("*.png"):
+            Image.open(path).verify()
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert finished == sorted(finished), "a scene was lost"
+    assert contents(target) == contents(out)
+
+
+def test_the_workers_of_a_killed_build_stop(kitti: Path, model: str, tmp_path: Path) -> None:
+    """A surviving worker would write into a database that is being resumed."""
+    if not Path("/proc/self/stat").exists():
+        pytest.skip("needs /proc to see processes")
+    command = [sys.executable, "-m", "edgeperc_export.cli", "database-build", str(kitti), str(tmp_path / "out")]
+    command += ["--workers", "2", "--road-by", model]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        children: list[int] = []
+        while process.poll() is None and len(children) < 2:
+            pids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            children = [int(pid) for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        process.kill()
+    assert children
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and any(map(alive, children)):
+        time.sleep(0.05)
+    assert not any(map(alive, children))
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def test_a_broken_scene_is_left_out_and_reported(
