@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import CalibrationError, PointsError
 from ..system.kernels import njit
-from ..types.points import Floats, Points, read_only
+from ..types.points import Floats, Points, by_axes, read_only
 from ..types.rigid import ROW_TOLERANCE, numbers_of, rigid
 
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
@@ -129,8 +129,8 @@ class Calibration:
 
         Parameters
         ----------
-        points : (n, 3 or more) array_like
-            x, y, z [m] in the sensor's frame; further columns are ignored.
+        points : (n, 3 or more) array_like, or a table
+            x, y, z [m] in the sensor's frame, those of a table by their names; further columns are ignored.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class Calibration:
             ``points`` has another shape.
         """
         try:
-            rows = read_only(points)
+            rows = read_only(by_axes(points))
         except (TypeError, ValueError) as exc:
             raise PointsError(f"got points that are not an array of numbers ({exc}); expected (n, 3 or more)") from exc
         if rows.ndim != 2 or rows.shape[1] < 3:

@@ -15,7 +15,7 @@ from ..errors import OptionError, PointsError
 from ..system.clock import elapsed_s
 from ..system.kernels import njit
 from ..types.perception import Box
-from ..types.points import Floats, Mask, read_only
+from ..types.points import Floats, Mask, by_axes, read_only
 from ..types.rigid import numbers_of
 from . import Track, Tracks
 from .tracker import FARTHEST_M
@@ -59,8 +59,8 @@ class Zone:
 
         Parameters
         ----------
-        points : (n, 2 or more) array_like
-            x, y [m].
+        points : (n, 2 or more) array_like, or a table
+            x, y [m]; those of a table by their names.
 
         Returns
         -------
@@ -72,7 +72,7 @@ class Zone:
         PointsError
             The points have another shape.
         """
-        rows = numbers_of("got points that are not numbers", points, PointsError, "(n, 2 or more)")
+        rows = numbers_of("got points that are not numbers", by_axes(points), PointsError, "(n, 2 or more)")
         if rows.ndim != 2 or rows.shape[1] < 2:
             raise PointsError(f"got points of shape {rows.shape}; expected (n, 2 or more): x, y")
         inside = np.empty(len(rows), np.bool_)

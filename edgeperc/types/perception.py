@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import ModelError, PointsError
 from ..system.fields import Fields
 from .choices import DEFAULT_SENSOR, STATIC
 from .mounting import MODEL_MOUNTING, Mounting
-from .points import Floats, Floats32, Ints, Labels, Mask, Points, as_points
+from .points import Floats, Floats32, Ints, Labels, Mask, Points, as_points, by_axes
 from .sensor import RemissionFunction, SensorProfile, get_sensor
 from .views import TopViewGeometry
 
@@ -438,20 +438,20 @@ class Perception:
         """``ground``; `ModelError`, which names the model to add, if it is None."""
         return _required(self.ground, "no ground", "pointseg", "and leave agree=True")
 
-    def to_map(self, points: NDArray[Any]) -> Floats:
+    def to_map(self, points: ArrayLike) -> Floats:
         """Coordinates of points of the scan in the map, x, y, z [m], (n, 3) float64; exact, unlike float32.
 
         Parameters
         ----------
-        points : (n, 3 or more) array
-            x, y, z [m] in the frame of the scan, such as the scan itself.
+        points : (n, 3 or more) array_like, or a table
+            x, y, z [m] in the frame of the scan, such as the scan itself; those of a table by their names.
 
         Raises
         ------
         PointsError
             The place of the scan in a map was not given.
         """
-        return np.asarray(points)[:, :3].astype(np.float64) + np.array(self._origin())
+        return np.asarray(by_axes(points))[:, :3].astype(np.float64) + np.array(self._origin())
 
     @property
     def map_boxes(self) -> tuple[Box, ...]:

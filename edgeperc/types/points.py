@@ -151,6 +151,13 @@ def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return _numeric((name, flat[name]) for name in table.dtype.names or ())
 
 
+def by_axes(points: ArrayLike) -> ArrayLike:
+    """x, y and z of a table, a data frame or a structured array, whatever the order of its columns; else as given."""
+    columns = _frame_columns(points) if not isinstance(points, np.ndarray) else table_columns(points)
+    axes = [columns[axis] for axis in "xyz" if axis in columns]
+    return np.column_stack(axes) if axes else points
+
+
 def _numeric(fields: Iterable[tuple[Any, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """The first of the columns of numbers with each `plain_name`."""
     columns: dict[str, NDArray[Any]] = {}

@@ -16,8 +16,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeperc import Box, ModelError, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError, Tracks
+from edgeperc import (
+    Box,
+    ModelError,
+    Perception,
+    PointLabels,
+    PointsError,
+    TopView,
+    Tracker,
+    TrackingError,
+    Tracks,
+    Zone,
+)
 from edgeperc.records import SCAN_KEYS, read_boxes, scan_record
+from edgeperc.simulation.camera import forward_camera
 
 CAR = Box("car", 0.87654321, (12.34567, -1.5, -0.9), (4.1, 1.7, 1.5), 0.1234567)
 VIEW = (0.1, (0.0, 40.0), (-10.0, 10.0))
@@ -227,6 +239,17 @@ def test_boxes_and_points_are_placed_in_the_map(origin: tuple[float, float, floa
     assert [Box.from_dict(box) for box in record["map_boxes"]] == [
         Box.from_dict(box.to_dict()) for box in perception.map_boxes
     ]
+
+
+@pytest.mark.parametrize("frame", ["pandas", "array"])
+def test_points_of_a_table_are_taken_by_the_names_of_its_columns(frame: str) -> None:
+    """By position, they would be other axes."""
+    x, y, z, remission = points = np.random.default_rng(0).normal(0.0, 30.0, (4, 50)).astype(np.float32)
+    table = np.rec.fromarrays([remission, z, y, x], names="intensity,z,y,x")
+    zone, placed = Zone([(-20, -20), (30, -20), (30, 20)]), replace(perception_of(CAR), origin_m=(1.0, 2.0, 3.0))
+    given = pytest.importorskip("pandas").DataFrame(table) if frame == "pandas" else table
+    for take in (placed.to_map, zone.mark, forward_camera().project):
+        np.testing.assert_array_equal(take(given), take(points.T))
 
 
 def test_without_an_origin_nothing_is_in_a_map() -> None:
