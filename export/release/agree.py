@@ -165,16 +165,12 @@ def _measure(
     semantickitti: Path | None,
     labeled: Sequence[ScanFolder],
 ) -> Measured:
-    by = ""
-
-    def judge_of(sensor: SensorProfile | None = None) -> Judge:
-        nonlocal by
-        judge = Judge([variant.path], Perceiving(boxes_from="network"), sensor=sensor)
-        by = _engine(judge.perceive.sessions[0], precision)
-        return judge
+    sensors: list[SensorProfile | None] = [None, *(folder.layout.sensor for folder in labeled)]
+    judges = [Judge([variant.path], Perceiving(boxes_from="network"), sensor=sensor) for sensor in sensors]
+    by, *_ = (_engine(judge.perceive.sessions[0], precision) for judge in judges)  # one for all
 
     def answers() -> Iterator[tuple[str, Judge, Truth, Perception, Sequence[Box] | None]]:
-        judge = judge_of()
+        judge, *of_sets = judges
         if kitti is not None:
             objects = KittiObjects(kitti)
             for name in _spread(objects.names(split), n_scans):
@@ -185,8 +181,7 @@ def _measure(
             for name in _spread(roads.names("all"), n_scans):
                 truth = judge.semantickitti(roads.frame(name))
                 yield "road", judge, truth, judge.perceive(truth.points), None
-        for folder in labeled:
-            judge = judge_of(folder.layout.sensor)
+        for folder, judge in zip(labeled, of_sets, strict=True):
             for name in _spread(folder.names(split), n_scans):
                 yield folder.layout.name, judge, *judge.perceive_frame(folder.frame(name))
 
