@@ -147,8 +147,7 @@ def _to_convert(thing: Any) -> tuple[str, str] | None:
 
 def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """The numeric fields of a structured array of any shape, each (n,), by `plain_name`."""
-    flat = table.reshape(-1)
-    return _numeric((name, flat[name]) for name in table.dtype.names or ())
+    return _numeric((name, table[name].reshape(-1)) for name in table.dtype.names or ())
 
 
 def by_axes(points: ArrayLike) -> ArrayLike:
