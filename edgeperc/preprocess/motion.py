@@ -35,6 +35,7 @@ UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
 COARSEST_S = 0.002  # of times: 0.06 m at 30 m/s
 LONGEST_GAP_S = 2.0  # between poses of a moving sensor: whoever stands still may write none
+LONGEST_S = 60.0  # of a constant motion; a tenth of a second in nanoseconds would be three years of standing still
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +82,17 @@ class Motion:
         TrackingError
             A pose is not rigid, or between the poses is about half a turn or more.
         StampError
-            A time is not finite, or the second is not later.
+            A time is not finite, or the second is not later, or later by more than a minute.
         """
         first = rigid("T_world_first", T_world_first, TrackingError)
         second = rigid("T_world_second", T_world_second, TrackingError)
         if not 0.0 < second_s - first_s < math.inf:
             raise StampError(f"got poses at {first_s} s and {second_s} s; expected a second one that is later")
+        if second_s - first_s > LONGEST_S:
+            raise StampError(
+                f"got poses that are {second_s - first_s:g} s apart; expected at most {LONGEST_S:g} s: are the times "
+                "in another unit?"
+            )
         R = first[:3, :3].T @ second[:3, :3]
         axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         sine = 0.5 * float(np.linalg.norm(axis))

@@ -126,6 +126,8 @@ def test_errors_name_the_reason() -> None:
     for stamps in ((1.0, 1.0), (2.0, 1.0), (0.0, math.nan), (0.0, math.inf)):
         with pytest.raises(StampError, match="expected a second one that is later"):
             Motion.between(eye, stamps[0], eye, stamps[1])
+    with pytest.raises(StampError, match=r"1e\+08 s apart.*another unit"):
+        Motion.between(eye, 1.8e18, eye, 1.8e18 + 1e8)
     with pytest.raises(TrackingError, match="180 degrees"):
         Motion.between(eye, 0.0, np.diag([-1.0, -1.0, 1.0, 1.0]), 1.0)
     for wrong, message in ((np.stack([eye] * 3), "of shape"), (np.stack([eye, 2 * eye]), "not rigid")):
