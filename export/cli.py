@@ -408,6 +408,7 @@ def _quantize(args: argparse.Namespace) -> None:
             kitti=args.kitti,
             n_simulated=args.simulated,
             fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
+            sparse=card.training.get("recipe", {}).get("sparse", False),
         )
     if of_objects:
         from .release.object_int8 import quantize_objects

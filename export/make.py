@@ -29,6 +29,7 @@ MORE_SCANS: Mapping[str, tuple[int, Mapping[str, int], str]] = {
         dict.fromkeys(("vlp-16", "vlp-32c", "hdl-32e", "os1-64", "pandar64", "mid-360"), 200),
         "street",
     ),
+    "sparse": (30_000, {"vlp-16": 700, "vlp-32c": 400, "hdl-32e": 200, "mid-360": 200}, "street"),
     "halls": (600_000, dict.fromkeys(OBJECT_SENSORS, 90), "hall"),
     "yards": (700_000, dict.fromkeys(OBJECT_SENSORS, 120), "yard"),
 }

@@ -130,6 +130,10 @@ class Recipe:
         "share of scans of the training sensor that are thinned to the beams and columns of another one, drawn at "
         "random: a known one, one with 12 to 48 beams, or one without beams",
     )
+    sparse: bool = _points(
+        False,
+        "the other sensors have few beams or none, and scans of every dense sensor are thinned, too (with --beams)",
+    )
     tilt_deg: float = _scans(
         0.25, "standard deviation of the roll and pitch by which scans are tilted [deg]: errors of the leveling"
     )
@@ -315,6 +319,9 @@ BEAMS = replace(
     redraw_every=0,
 )
 
+# For sensors of few beams, or without beams, whose range images are mostly filled: all scans are as these take them.
+SPARSE = replace(BEAMS, beams=1.0, sparse=True, kept=0.5, steps=5500, batch=16, ema=0.998)
+
 # LoDNN-I's structure at a quarter of the resolution, distilled from the start from the network with the best roads.
 LODNN = Recipe(
     "lodnn",
@@ -445,6 +452,7 @@ MODELS = {
     "lodnn-paper": Stage(PUBLISHED),
     "pointseg-start": Stage(EDGE),
     "pointseg": Stage(BEAMS, after="pointseg-start"),
+    "pointseg-sparse": Stage(SPARSE, after="pointseg", also=("sparse",)),
     "lodnn": Stage(LODNN, teacher="ssadnet"),
     # Three quarters of the channels: with all of them it learned the training scans, and found 8 of 255 boxes less.
     "ssadnet": Stage(

@@ -320,6 +320,7 @@ class Augmentation:
     tilt_deg: float = 0.0
     no_remission: float = 0.0  # share of scans whose remission is the constant that stands for a missing one
     range_noise_m: float = 0.0  # half of the scans get noise along the rays, of a standard deviation up to this
+    sparse: bool = False  # scans of any dense sensor are thinned, not those of the training sensor alone
 
 
 def augmented(
@@ -332,7 +333,7 @@ def augmented(
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
     A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
-    turned by a few degrees only. ``sensor`` takes a scan of the training sensor (`beams.taken_by`).
+    turned by a few degrees only. ``sensor`` takes a scan of a denser one (`beams.taken_by`).
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))
@@ -359,7 +360,7 @@ def augmented(
     if rng.random() < how.weather:
         scan = weathered(scan, rng)
     if sensor is not None:
-        scan = taken_by(sensor, scan, rng)
+        scan = taken_by(sensor, scan, rng, of_any=how.sparse)
     if how.range_noise_m > 0.0 and rng.random() < 0.5:
         scan = noisy(scan, rng, how.range_noise_m)
     points, labels = scan.points, scan.labels

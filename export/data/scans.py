@@ -51,6 +51,12 @@ class LabeledScan:
         return cls(points, frame.point_labels(), frame.boxes, counts, surface, CAMERA_AZIMUTHS)
 
     @classmethod
+    def unlabeled(cls, points: Points) -> LabeledScan:
+        """A scan of the training sensor of which nothing is known."""
+        unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
+        return cls(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown)
+
+    @classmethod
     def from_simulation(cls, scan: SimulatedScan) -> LabeledScan:
         """A simulated scan; everything is labeled, by `SCENE_CLASSES`."""
         surface = scan.top_view_labels(SURFACE)

@@ -39,6 +39,7 @@ from edgeperc.types.sensor import SensorProfile
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
 from .object_parity import TOP_VIEW, candidate_inputs, objects_of
+from .thinned import profile_of, thinned
 from .to_onnx import write_card
 
 T = TypeVar("T")
@@ -66,8 +67,8 @@ def agree(
     n_scans: int | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Measure every precision that the files of one network can run in on labeled scans or images, at most ``n_scans``
-    of each set, and write the record into their cards; ``labeled``: sets of any sensor. Raises ModelError, PointsError,
-    SplitError.
+    of each set, and write the record into their cards; ``labeled``: sets of any sensor. Of networks for sparse sensors,
+    KITTI's scans are thinned to a VLP-16's beams. Raises ModelError, PointsError, SplitError.
     """
     variants = {variant.precision: variant for model in models for variant in resolve(model)}
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
@@ -165,7 +166,8 @@ def _measure(
     semantickitti: Path | None,
     labeled: Sequence[ScanFolder],
 ) -> Measured:
-    sensors: list[SensorProfile | None] = [None, *(folder.layout.sensor for folder in labeled)]
+    sparse = profile_of("vlp-16") if variant.card.training.get("recipe", {}).get("sparse", False) else None
+    sensors: list[SensorProfile | None] = [sparse, *(folder.layout.sensor for folder in labeled)]
     judges = [Judge([variant.path], Perceiving(boxes_from="network"), sensor=sensor) for sensor in sensors]
     by, *_ = (_engine(judge.perceive.sessions[0], precision) for judge in judges)  # one for all
 
@@ -174,7 +176,8 @@ def _measure(
         if kitti is not None:
             objects = KittiObjects(kitti)
             for name in _spread(objects.names(split), n_scans):
-                truth = judge.kitti(objects.frame(name))
+                frame = objects.frame(name)
+                truth = judge.kitti(frame if sparse is None else thinned(frame, sparse))
                 yield "real", judge, truth, judge.perceive(truth.points), None
         if semantickitti is not None and judge.from_above is not None:
             roads = SemanticKitti(semantickitti)

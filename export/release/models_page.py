@@ -13,6 +13,7 @@ from typing import Any
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
+from edgeperc.types.choices import SPARSE_MODELS as SPARSE
 from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, MAX_LOSS, OPEN, Variant, digest, resolve
 
@@ -101,7 +102,8 @@ def _size(variant: Variant) -> str:
 def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
     yield from _prose(
         "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
-        f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+        f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant. "
+        + " ".join(f"For sparse sensors, `{sparse}` takes the place of `{name}`." for name, sparse in SPARSE.items())
     )
     yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):

@@ -55,6 +55,7 @@ from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats, Floats32, Ints64
 from edgeperc.types.sensor import get_sensor
 
+from ..data.beams import drawn_sensor, taken_by
 from ..data.scan_sets import check_trains, read_scan_set
 from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR, parity_samples
@@ -122,9 +123,10 @@ def calibration_scans(
     kitti: Path | None = None,
     n_simulated: int = 0,
     fitness: FitnessProfile | None = None,
+    sparse: bool = False,
 ) -> Calibration:
     """Scans to calibrate on: files or folders, like those of ``fitness``; 64 of the training drives of KITTI and of
-    each set; simulated. Raises SplitError, PointsError.
+    each set; simulated. ``sparse``: as sparse sensors take them. Raises SplitError, PointsError.
     """
     files = [file for path in paths for file in (_scans_in(path) if path.is_dir() else [path])]
     for file in files:
@@ -152,6 +154,10 @@ def calibration_scans(
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
         raise PointsError(f"no scan to calibrate on in {asked}; name scans, a root with training drives, or simulate")
+    if sparse:
+        rng = np.random.default_rng(FIRST_SEED)
+        every = [scan if isinstance(scan, LabeledScan) else LabeledScan.unlabeled(scan) for scan in scans]
+        scans = [taken_by(drawn_sensor(rng, sparse=True), scan, rng, of_any=True) for scan in every]
     return Calibration(scans, hashes)
 
 

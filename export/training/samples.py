@@ -128,7 +128,7 @@ class Samples:
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
-        sensor = drawn_sensor(rng) if rng.random() < recipe.beams else None
+        sensor = drawn_sensor(rng, sparse=recipe.sparse) if rng.random() < recipe.beams else None
         scan = augmented(scan, rng, self.augmentation, self.bank, sensor)
         if self.task.swaps_sectors and rng.random() < recipe.swap:
             other = augmented(self._scan(rng), rng, self.augmentation, self.bank, sensor)

@@ -26,7 +26,7 @@ from edgeperc.types.frame import ModelFrame
 from edgeperc.types.points import Bytes, Floats32
 
 from ..data.scan_sets import seen_by_network
-from ..data.scans import SURFACE, LabeledScan, mirrored, turned
+from ..data.scans import LabeledScan, mirrored, turned
 from .bfloat16 import in_bfloat16
 from .checkpoint import build_network, read_checkpoint
 from .task import Task, task_of
@@ -44,8 +44,7 @@ def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan
     for name in objects.unlabeled("train", fold=fold):
         points = read_points(objects.files(name)[0])
         points = points[np.isfinite(points).all(axis=1)]
-        unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
-        scans.append(LabeledScan(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown))
+        scans.append(LabeledScan.unlabeled(points))
     return scans
 
 

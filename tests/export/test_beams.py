@@ -83,6 +83,14 @@ def places(scan: LabeledScan) -> dict[tuple[float, ...], int]:
 
 @given(st.integers(0, 2**32))
 @settings(max_examples=20)
+def test_a_sparse_sensor_is_drawn_where_one_is_asked_for(seed: int) -> None:
+    sensor = drawn_sensor(np.random.default_rng(seed), sparse=True)
+    assert sensor.median_gap_deg >= 0.9
+    assert sensor.name in ("random", "vlp-16", "hdl-32e", "pandarxt-32", "os0-32", "os1-32", "mid-360")
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=20)
 def test_points_labels_and_boxes_stay_together(
     scan: LabeledScan, places: dict[tuple[float, ...], int], seed: int
 ) -> None:
@@ -102,8 +110,21 @@ def test_empty_scans_and_those_of_another_sensor_are_as_they_were(scan: LabeledS
     empty = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
     assert len(taken_by(sensor, empty, rng).points) == 0
     thinned = taken_by(sensor, scan, rng)
-    assert taken_by(get_sensor("os1-64"), thinned, rng) is thinned
+    for of_any in (False, True):
+        assert taken_by(get_sensor("os1-64"), thinned, rng, of_any=of_any) is thinned
     assert augmented(thinned, rng, sensor=get_sensor("os1-64")).sensor == sensor
+
+
+def test_scans_of_any_dense_sensor_are_thinned_where_it_is_asked_for() -> None:
+    rng, sensor = np.random.default_rng(0), get_sensor("vlp-16")
+    pandar = replace(LabeledScan.from_simulation(simulated_scan(SEED, "pandar64")), sensor=get_sensor("pandar64"))
+    assert taken_by(sensor, pandar, rng) is pandar
+    thinned = taken_by(sensor, pandar, rng, of_any=True)
+    counts = [len(scan.points) for scan in (thinned, taken_by(sensor, replace(pandar, sensor=None), rng))]
+    true = len(simulated_scan(SEED, "vlp-16").points)
+    assert abs(counts[0] - true) < 0.25 * true < abs(counts[1] - true)  # by its own beams, which are few above
+    apart = np.abs(elevations_deg(thinned.points)[:, None] - np.array(sensor.elevations_deg)).min(1)
+    assert np.quantile(apart, 0.99) < 0.8
 
 
 def test_the_recipe_says_how_often(tmp_path_factory: pytest.TempPathFactory, scan: LabeledScan) -> None:

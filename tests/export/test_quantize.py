@@ -29,6 +29,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.views import RangeImageGeometry
 from edgeperc.zoo import model_path
+from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.release import quantize as module
 from edgeperc_export.release.agree import agree
 from edgeperc_export.release.quantize import (
@@ -347,6 +348,15 @@ def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> No
     assert 0 < len(found) == len(hashes) <= 64
     assert test
     assert not test & set(hashes)
+
+
+def test_what_is_for_sparse_sensors_is_calibrated_on_their_scans() -> None:
+    dense, sparse = (calibration_scans(n_simulated=3, sparse=sparse).scans for sparse in (False, True))
+    for scan, thinned in zip(dense, sparse, strict=True):
+        assert isinstance(thinned, LabeledScan)
+        assert thinned.sensor is not None
+        assert thinned.sensor.median_gap_deg >= 0.9
+        assert 0 < len(thinned.points) < 0.7 * len(scan)  # type: ignore[arg-type]
 
 
 def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
