@@ -20,6 +20,7 @@ from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
+from .inference.networks import Networks
 from .inference.object_network import BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
 from .inference.session import Session
@@ -129,8 +130,9 @@ class Perceiver:
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
         model per view: top view, range image, objects, pillars (a detector of yours) and camera. None takes the LiDAR
-        models together that ``weights`` names, by default the best ones, `edgeperc.zoo.DEFAULT`. The options of scans
-        have no effect on a camera.
+        models together that ``weights`` names, by default the best ones, `edgeperc.zoo.DEFAULT`. For a sparse sensor
+        (`SensorProfile.is_sparse`), ``"pointseg"`` is ``"pointseg-sparse"``; ``"pointseg:int8"`` is not. The options
+        of scans have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile. ``"auto"``: the one whose beams the first scan has, or a profile of its beams
@@ -334,11 +336,11 @@ class Perceiver:
     ) -> None:
         """Load the models, assemble the pipeline and compile every kernel."""
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
-        self.sessions = tuple(
-            Session(model, provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted)
-            for model in wanted
+        load = partial(
+            Session, provider=provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted
         )
-        self.cards = tuple(session.card for session in self.sessions)
+        self._networks = Networks(wanted, precision, load)
+        self._load(self.sensor)
         views = [card.view.kind for card in self.cards]
         if len(views) != len(set(views)):
             raise OptionError(f"models {[str(m) for m in wanted]} have views {views}; expected at most one a view")
@@ -351,8 +353,6 @@ class Perceiver:
                 "boxes_from is 'clusters', which needs a class for every point or for every cluster; add a range-image "
                 "model or one of objects"
             )
-        self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
-        self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
         self._calls = Calls("a Perceiver")
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
         self._pipeline = self._assemble(self.sensor)
@@ -367,6 +367,14 @@ class Perceiver:
                 compile_votes()
                 coarse = get_sensor(COARSE_SENSOR)  # fills the gaps between its beams
                 warm_up(self._assemble(coarse) or self._pipeline, coarse, [], self._estimator)
+
+    def _load(self, sensor: SensorProfile) -> None:
+        """Load the networks of a sensor."""
+        own = vars(self)
+        own["sessions"] = sessions = self._networks.of(sensor)
+        own["cards"] = tuple(session.card for session in sessions)
+        own["providers"] = MappingProxyType({session.card.name: session.description for session in sessions})
+        self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
 
     def _assemble(self, sensor: SensorProfile) -> Pipeline | None:
         """The pipeline of the LiDAR networks; None without any."""
@@ -464,8 +472,8 @@ class Perceiver:
         """Forget the scans so far, and continue from what another perceiver has learned."""
         with self._calls.one():
             if self._finds_sensor:
-                self._sensor_estimate = learned.sensor_estimate
                 self._use(learned.remission.sensor)
+                self._sensor_estimate = learned.sensor_estimate
             self._remission, self._to_check, self._normal = learned.remission, learned.to_check, learned.normal
             self._set_mounting(learned.mounting)
 
@@ -477,13 +485,14 @@ class Perceiver:
         """Use the sensor whose beams the scan has; SensorError if it does not tell."""
         found = estimate_sensor([scan])
         found.tell_doubt(self.on_mismatch)
-        self._sensor_estimate = found
         self._use(found.profile)
+        self._sensor_estimate = found
 
     def _use(self, sensor: SensorProfile) -> None:
         """Take further scans as this sensor's."""
         if sensor == self.sensor:
             return
+        self._load(sensor)
         vars(self)["sensor"] = sensor
         self._remission, self._normal = RemissionMatcher(sensor), Normal()
         self._pipeline = self._assemble(sensor)

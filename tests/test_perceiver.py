@@ -37,12 +37,13 @@ from edgeperc import (
     StampError,
     pipeline,
 )
-from edgeperc.inference import providers, session
+from edgeperc.inference import networks, providers, session
 from edgeperc.objects.boxes import weigh
 from edgeperc.pipeline import Pipeline
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
 from edgeperc.system.lanes import Stopwatch
+from edgeperc.types.choices import SPARSE_MODELS
 from edgeperc.types.geometry import inside, oriented_iou
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import PointLabels
@@ -759,6 +760,45 @@ def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) ->
     other = "os1-64" if name == "vlp-16" else "vlp-16"
     finds(urban(8, other).points)
     assert finds.sensor.name == other
+
+
+@pytest.mark.parametrize(
+    ("model", "sensor", "precision", "loaded"),
+    [
+        ("pointseg", "hdl-64e", "auto", "pointseg"),
+        ("pointseg", "vlp-32c", "auto", "pointseg"),  # a third of a degree between the beams around the horizon
+        ("pointseg", "vlp-16", "auto", "pointseg-sparse"),
+        ("pointseg", "mid-360", "int8", "pointseg-sparse"),
+        ("pointseg:int8", "vlp-16", "auto", "pointseg"),
+        ("sceneseg", "vlp-16", "auto", "sceneseg"),
+    ],
+)
+def test_a_sparse_sensor_has_weights_of_its_own(model: str, sensor: str, precision: str, loaded: str) -> None:
+    perceive = Perceiver(model, sensor=sensor, precision=precision, provider="cpu")
+    assert [card.name for card in perceive.cards] == [*perceive.providers] == [loaded]
+    assert [session.card.name for session in perceive.sessions] == [loaded]
+
+
+@pytest.mark.parametrize("precision", ["fp32", "int8"])
+def test_a_precision_that_sparse_weights_lack_takes_the_others(monkeypatch: pytest.MonkeyPatch, precision: str) -> None:
+    """As in the wheel, which has them in int8 alone."""
+    int8 = [variant for variant in networks.resolve("pointseg-sparse") if variant.precision == "int8"]
+    monkeypatch.setattr(networks, "resolve", lambda _: int8)
+    perceive = Perceiver("pointseg", sensor="vlp-16", precision=precision, provider="cpu")
+    assert [*perceive.providers] == ["pointseg-sparse" if precision == "int8" else "pointseg"]
+
+
+def test_the_weights_are_those_of_the_sensor_that_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    finds = Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="ignore")
+    for sensor, loaded in (("hdl-64e", "pointseg"), ("vlp-16", "pointseg-sparse"), ("hdl-64e", "pointseg")):
+        assert [*finds(urban(8, sensor).points).providers] == [loaded]
+        finds.reset_mounting()
+    first = Perceiver("pointseg", sensor="auto", provider="cpu", on_mismatch="ignore")
+    monkeypatch.setitem(SPARSE_MODELS, "pointseg", "nowhere.onnx")
+    for _ in range(2):  # nothing of the sensor is learned before its weights are there
+        with pytest.raises(ModelFileError, match="nowhere"):
+            first(urban(8, "vlp-16").points)
+    assert [*first(urban(8).points).providers] == ["pointseg"]
 
 
 def test_a_sensor_that_hangs_sees_what_one_with_its_beams_turned_over_sees() -> None:

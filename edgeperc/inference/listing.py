@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 from ..errors import MissingExtraError
 from ..types.card import ModelCard
+from ..types.choices import SPARSE_MODELS
 from ..types.sensor import SENSORS
 from ..zoo import DEFAULT, listed
 from .providers import PROVIDERS, available_providers
@@ -146,7 +147,8 @@ def models() -> tuple[ModelInfo, ...]:
 def purpose(card: ModelCard) -> str:
     """Describe what a model detects, from its view and its classes."""
     if card.view.kind == "range_image":
-        return f"a class for every point ({', '.join(card.classes[1:])})"
+        sensors = " of sparse sensors" * (card.name in SPARSE_MODELS.values())
+        return f"a class for every point{sensors} ({', '.join(card.classes[1:])})"
     if card.view.kind == "camera":
         return f"a class for every pixel of a camera's image ({len(card.classes)} classes)"
     if card.view.kind == "pillars":

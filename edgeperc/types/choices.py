@@ -3,6 +3,8 @@
 DEFAULT_MODELS = ("ssadnet", "pointseg", "objects")
 OPEN_MODELS = ("ssadnet-open", "sceneseg", "objects-open")
 WEIGHTS = {"default": DEFAULT_MODELS, "open": OPEN_MODELS}
+SPARSE_MODELS = {"pointseg": "pointseg-sparse"}
+"""By a model's name, the one that takes its place for sensors of few beams, or without beams."""
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 AUTO_SENSOR = "auto"  # found in the points

@@ -35,6 +35,7 @@ SCHEMA = 2  # of a sensor profile's file
 # Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
 # sensors measure from 0.05 to 1 m on.
 MIN_RANGE_M = 0.5
+SPARSE_GAP_DEG = 1.5
 MAX_EGO_M = 100.0
 MIN_ACCUMULATE_S, MAX_ACCUMULATE_S = 0.01, 10.0
 
@@ -325,6 +326,18 @@ class SensorProfile:
         return len(self.elevations_deg)
 
     @property
+    def is_sparse(self) -> bool:
+        """Whether the median gap between its beams is at least 1.5 degrees: most rows of a range image are then
+        interpolated. Of a sensor without beams, those of one that would show as much.
+        """
+        return self.median_gap_deg >= SPARSE_GAP_DEG
+
+    @property
+    def median_gap_deg(self) -> float:
+        """Median of the gaps between neighboring beams [deg]; 0 of a single one."""
+        return float(np.median([upper - lower for upper, lower in pairwise(self.elevations_deg)] or [0.0]))
+
+    @property
     def fov_up_deg(self) -> float:
         """Elevation of the top beam [deg]."""
         return self.elevations_deg[0]
@@ -346,8 +359,7 @@ class SensorProfile:
         An object whose return between two others is missing stays linked at any range
         (`edgeperc.objects.cluster.find_clusters`).
         """
-        gaps_deg = [upper - lower for upper, lower in pairwise(self.elevations_deg)]
-        return 2.0 * math.radians(max(float(np.median(gaps_deg or [0.0])), self.azimuth_resolution_deg))
+        return 2.0 * math.radians(max(self.median_gap_deg, self.azimuth_resolution_deg))
 
     @property
     def mount_height_m(self) -> float:
