@@ -142,9 +142,8 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
         assert arguments[0] == "clone"
     elif program == "python":
         assert arguments[0] == "-m"
-        assert (
-            (REPOSITORY / arguments[1].replace(".", "/").replace("edgeperc_bench", "bench")).with_suffix(".py").exists()
-        )
+        module = arguments[1].replace(".", "/").replace("edgeperc_bench", "bench").replace("edgeperc_export", "export")
+        assert (REPOSITORY / module).with_suffix(".py").exists()
     elif block.excuse.startswith("parsed only:") or program != "edgeperc":
         said = block.excuse.startswith("parsed only:")
         assert said or arguments in (["--help"], ["--version"]), "say why it is not run"

@@ -140,6 +140,7 @@ def _compare_one(
     function = sensor.remission
     result: dict[str, Any] = {
         "n_scans": n_scans,
+        "network": perceivers["none"].cards[0].name,
         "function": None
         if function is None
         else f"{function.kind} {', '.join(f'{c:.4g}' for c in function.coefficients)}",

@@ -593,6 +593,8 @@ def test_eval_sensors(tmp_path: Path, shell: Shell) -> None:
     figures = json.loads(out.read_text())
     simulated, boxed, pictured = (figures[name] for name in datasets)
     assert simulated["n_scans"] == 1
+    assert "os1-64=simulation:1, pointseg: 1 scan" in printed
+    assert {figures[name]["network"] for name in datasets} == {"pointseg"}
     assert simulated["function"].startswith(("logarithm", "linear", "power"))
     assert (boxed["n_scans"], pictured["n_scans"]) == (1, 1)
     near_cars = [b for b in scan.boxes if b.label in ("car", "van", "truck") and np.hypot(*b.center[:2]) < 40.0]

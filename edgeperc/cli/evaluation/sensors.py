@@ -65,7 +65,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
     with progress() as show:
         how = keywords(arguments, "provider", "precision", "workers")
         figures = compare(arguments.datasets, arguments.model, on_scan=show, **how)
-    lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
+    lines = ["IoU of points in per cent, mIoU over the classes shown"]
     for name, result in figures.items():
         rows = [((kind, ""), {**result[kind]["iou"], "mean": result[kind]["mean_iou"]}) for kind in ADAPTATIONS]
         counts = ", ".join(f"{count:,} {label}" for label, count in result["both"]["n_points"].items())
@@ -74,7 +74,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         labels = [label for label in result["both"]["iou"] if label != "background"]
         columns = [(f"{label}{FEW * (label in result['few'])}", label) for label in labels]
         function = result["function"] or "no function"
-        title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
+        title = f"{name}, {result['network']}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
         lines += box_table_lines(result.get("boxes", {}))
         if "no_boxes" in result:
