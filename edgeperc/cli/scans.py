@@ -35,6 +35,7 @@ _LAYOUTS = (
 )
 # Folder names of these layouts that do not identify a scan.
 _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
+_TIME = re.compile(r"[1-9]\d{9,}(\.\d+)?")  # a name that is a time since 1970, in s to ns
 
 
 class Scans(NamedTuple):
@@ -155,6 +156,29 @@ def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Se
                     f"--scan: {image} would get {scan}, and {own[image.stem]} has its name; expected the scan of each "
                     "image in its place: is an image or a scan missing?"
                 )
+    _warn_of_times(pairs)
+
+
+def _warn_of_times(pairs: Sequence[tuple[Path, Path | Remote]]) -> None:
+    """Warn of an image whose scan is another one's by the times in their names; clocks may differ, so no error."""
+    import numpy as np
+
+    from ..sinks.run_file import stem_of
+
+    stems = [[stem_of(file.name)[0] for file in pair] for pair in pairs]
+    if not all(_TIME.fullmatch(stem) for pair in stems for stem in pair):
+        return
+    times = np.array(stems, np.float64)
+    for (image, scan), (at, taken) in zip(pairs, times, strict=True):
+        apart = np.abs(times[:, 1] - at)
+        # Half as far: the stamp of a scan may be of the begin, middle or end of its turn.
+        if apart.min() < 0.5 * abs(taken - at):
+            warnings.warn(
+                f"--scan: {image} gets {scan}, and by the times in their names {pairs[int(apart.argmin())][1]} is "
+                "nearer. Images and scans are paired in their order: is an image or a scan missing?",
+                stacklevel=3,
+            )
+            return
 
 
 def scan_namer(path: Path) -> Callable[[int], Path]:

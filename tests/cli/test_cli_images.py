@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from cli_helpers import Shell, run, write_scan
 pillow = pytest.importorskip("PIL.Image")
 
 import edgeperc
+from edgeperc.cli.scans import check_pairs
 from edgeperc.errors import ImageError
 from edgeperc.simulation.camera import CAMERA_CLASSES
 from edgeperc.types.perception import ImageLabels, Perception
@@ -91,6 +93,13 @@ def test_what_is_written_of_a_scan_with_its_image_is_of_the_scan(tmp_path: Path,
     said = shell.err("run", image, "--scan", scan, *options, "--movable", "--static", tmp_path, code=1)
     assert "is the scan itself" in said
     assert scan.read_bytes() == before
+
+
+def test_times_in_names_tell_that_a_pair_is_none() -> None:
+    images, scans = ([Path(f"{1_700_000_000 + k / 10 + at:.2f}.x") for k in range(5)] for at in (0.02, 0.0))
+    check_pairs(argparse.Namespace(), images[:4], scans[:4])
+    with pytest.warns(UserWarning, match=f"{images[1]} gets {scans[2]}, and .* {scans[1]} is nearer"):
+        check_pairs(argparse.Namespace(), images[:4], scans[1:])
 
 
 def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path) -> None:
