@@ -68,7 +68,15 @@ class LabeledImages:
                         f"{path}: {opened.size[0]} x {opened.size[1]} pixels of mode {opened.mode}; expected an id for "
                         f"each of the {image.shape[1]} x {image.shape[0]} pixels of {file.name}"
                     )
-                ids = np.asarray(opened)
+                ids, palette = np.asarray(opened), opened.getpalette() or []
+            shown = np.array(palette, np.uint8).reshape(-1, 3)
+            grays, used = shown[:, 0], np.unique(ids[ids < len(shown)])
+            are_ids = ((grays[used] < self._n_ids) | (grays[used] == IGNORE)).all()
+            if (shown == grays[:, None]).all() and are_ids and (grays[used] != used).any():
+                raise ImageError(
+                    f"{path}: the grays of its palette are ids in another order than its indices, as programs that "
+                    "make PNG files smaller write them; expected the id of each pixel: save it as gray of 8 bits"
+                )
             unnamed = ids[(ids >= self._n_ids) & (ids != IGNORE)]
             if unnamed.size:
                 raise ImageError(

@@ -144,6 +144,11 @@ def test_what_cannot_be_evaluated(tmp_path: Path, model: Path) -> None:
     pillow.fromarray(labels(0, 1, 2, 4)).save(annotation)
     with pytest.raises(ImageError, match="192 pixels have ids up to 4; expected the ids 0 to 3 of"):
         evaluate_images([root], model)
+    sorted_by_number = pillow.fromarray(labels(1, 0, 2, 2))  # as a palette of the grays 2, 0, 1
+    sorted_by_number.putpalette(np.repeat(np.uint8([2, 0, 1]), 3).tobytes())
+    sorted_by_number.save(annotation)
+    with pytest.raises(ImageError, match="the grays of its palette are ids in another order"):
+        evaluate_images([root], model)
     annotation.write_bytes(b"no image")
     with pytest.raises(ImageError, match="the labels cannot be read"):
         evaluate_images([root], model)
