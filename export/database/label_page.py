@@ -30,7 +30,7 @@ from edgeperc.system.atomic import write_atomic
 from edgeperc.system.fields import Fields
 from edgeperc.system.printable import printable
 
-from ..data.roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
+from ..data.roads import HEIGHT, ROAD, WIDTH, DatabaseError, read_coco, write_coco
 from .coco import draft
 from .files import TopViewDatabase
 
@@ -142,6 +142,13 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]], d
         rings = [ring for each in segmentations for ring in each]
         roads[name] = [[[float(x), float(y)] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
     content = json.loads(path.read_text())
+    drawn = {annotation["category_id"] for annotation in content["annotations"]}
+    named = {str(category["name"]) for category in content["categories"] if category["id"] in drawn}
+    if others := sorted(name for name in named if name.lower() not in ROAD):
+        raise DatabaseError(
+            f"{path} has annotations of {', '.join(others)}, which the page would drop when it saves; give a copy "
+            "that has roads alone"
+        )
     scans = {Path(image["file_name"]).stem: image["scan"] for image in content["images"] if "scan" in image}
     try:
         drafts = {name: _clamped(rings) for name, rings in content.get("drafts", {}).items()}

@@ -170,9 +170,10 @@ def test_a_file_that_cannot_be_edited_is_refused(server: LabelServer, out: Path,
         with pytest.raises(DatabaseError, match="drafts that are no polygons"):
             LabelServer(out, server.polygons)
     runs = {"size": [400, 200], "counts": [80_000]}
-    (tmp_path / "runs.json").write_text(drawn(annotation={"segmentation": runs}))
-    with pytest.raises(DatabaseError, match="run lengths"):
-        LabelServer(out, tmp_path / "runs.json")
+    for change, said in (({"segmentation": runs}, "run lengths"), ({"category_id": 1}, "annotations of background")):
+        (tmp_path / "other.json").write_text(drawn(annotation=change))
+        with pytest.raises(DatabaseError, match=said):
+            LabelServer(out, tmp_path / "other.json")
 
 
 def test_a_file_that_cannot_be_written_is_reported(server: LabelServer, capsys: pytest.CaptureFixture[str]) -> None:
