@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -91,8 +91,14 @@ def _image_source(recipe: Recipe, data: Data, device: torch.device) -> Source:
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
     task = Camera.of(recipe)
     samples, watch = camvid_samples(task, data.camvid, device)
-    labels = hashlib.sha256(samples.images.labels.cpu().numpy().tobytes()).hexdigest()
-    return Source(samples, watch, samples.images.hashes, len(samples.images.hashes), {LABELS: labels})
+    labels, hashes = samples.images.labels.cpu().numpy(), samples.images.hashes
+    if (labels == IGNORE).all():
+        raise ValueError(
+            f"no pixel of the {len(hashes)} images to train on has a class, so that nothing can be learned; see "
+            f"{data.camvid / 'classes.json'}, and the ids in trainannot"
+        )
+    _check_apart("image", hashes, watch.images.hashes)
+    return Source(samples, watch, hashes, len(hashes), {LABELS: hashlib.sha256(labels.tobytes()).hexdigest()})
 
 
 def _object_source(recipe: Recipe, folder: Path, data: Data, n_workers: int) -> Source:
@@ -172,13 +178,18 @@ def _real(
             trained.append(read("train"))
         watched.append(read("validation"))
     own, seen = joined(trained), joined(watched)
-    names_of = {digest: name for name, digest in own.hashes.items()}
-    if twice := next((name for name, digest in seen.hashes.items() if digest in names_of), None):
+    _check_apart("scan", own.hashes, seen.hashes)
+    return own, seen.scans
+
+
+def _check_apart(what: str, trained: Mapping[str, str], watched: Mapping[str, str]) -> None:
+    """Raise ValueError if one is trained on and watched, by hashes of names."""
+    names_of = {digest: name for name, digest in trained.items()}
+    if twice := next((name for name, digest in watched.items() if digest in names_of), None):
         raise ValueError(
-            f"the validation scan {twice} is the training scan {names_of[seen.hashes[twice]]}, byte for byte; its "
+            f"the validation {what} {twice} is the training {what} {names_of[watched[twice]]}, byte for byte; its "
             "figures would be too good. Remove one, or put both drives into one split"
         )
-    return own, seen.scans
 
 
 def _check_labels(task: Task, real: Sequence[LabeledScan], *, simulated: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -203,6 +204,17 @@ def test_unlabeled_pixels_are_ignored_and_other_classes_refused(drawn: Path, tmp
     (tmp_path / "classes.json").write_text(json.dumps({"0": "road", "1": "void"}))
     with pytest.raises(ImageError, match="expected"):
         read_camvid(tmp_path, "train")
+
+
+def test_images_that_teach_nothing_or_are_watched_too_are_refused(drawn: Path, tmp_path: Path) -> None:
+    for name in ("void", "twice"):
+        shutil.copytree(drawn, tmp_path / name)
+    for path in (tmp_path / "void/trainannot").iterdir():
+        Image.fromarray(np.full((72, 96), 11, np.uint8)).save(path)
+    shutil.copy(tmp_path / "twice/train/002.png", tmp_path / "twice/val/001.png")
+    for name, said in (("void", "nothing can be learned"), ("twice", "image 001 is the training image 002")):
+        with pytest.raises(ValueError, match=said):
+            train(replace(Recipe("camseg"), **SMALL), tmp_path / "run", camvid=tmp_path / name)
 
 
 @pytest.fixture
@@ -491,8 +503,6 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
 
 
 def test_comparison_is_one_command(drawn: Path, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    from edgeperc_export.training import camvid
-
     asked: dict[str, Any] = {}
     row = {"name": "SegNet", "parameters": 1, "miou_interval": [0.1, 0.2], **dict.fromkeys(camvid.FIGURES, 0.15)}
     monkeypatch.setattr(camvid, "ablate_camvid", lambda root, out, **given: asked.update(given) or [row])
