@@ -14,7 +14,7 @@ from edgeperc import __version__
 from edgeperc.cli.arguments import Options, count, keywords, options, positive, positive_number
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
-from edgeperc.errors import CardError, CardMismatchError, EdgepercError, MissingExtraError, ModelError
+from edgeperc.errors import CardError, CardMismatchError, EdgepercError, MissingExtraError, ModelError, OptionError
 from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
@@ -394,7 +394,9 @@ def _quantize(args: argparse.Namespace) -> None:
     card = ModelCard.read(args.model)
     of_objects = card.view.kind == "objects"
     how = {"seven_bits": not args.eight_bits, "n_threads": args.threads}
-    if args.camvid is not None and not of_objects:
+    if card.view.kind == "camera":
+        if args.camvid is None:
+            raise OptionError(f"{args.model} is of a camera; give --camvid to calibrate and evaluate it on")
         calibration = calibration_images(args.camvid)
     else:
         sets = [

@@ -151,7 +151,7 @@ class PrelabelSink:
             for box, _ in boxes
         ]
         document = {"folder": source.parent.name, "filename": source.name, "path": scan.name, "objects": objects}
-        self._write_json(f"labels/{name}.json", scan.name, document)
+        self._write(f"labels/{name}.json", scan.name, _json(document))
 
     def _sustechpoints(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         document = [
@@ -166,7 +166,7 @@ class PrelabelSink:
             }
             for box, number in boxes
         ]
-        self._write_json(f"label/{name}.json", scan.name, document)
+        self._write(f"label/{name}.json", scan.name, _json(document))
 
     def _cvat(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
         self._files.checked(self._folder / name, scan.name)
@@ -209,9 +209,6 @@ class PrelabelSink:
         lines = [_kitti_line(box, T_cam_sensor, P2, size) for box, _ in boxes]
         self._write(f"calib/{name}.txt", scan.name, text.encode())  # first: labels are nothing without their camera
         self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
-
-    def _write_json(self, name: str, scan: str, document: Any) -> None:
-        self._write(name, scan, _json(document))
 
     def _write(self, name: str, scan: str, content: bytes) -> None:
         target = self._folder / name
