@@ -28,9 +28,9 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from edgeperc import __version__
-from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import TEST_DRIVES
-from edgeperc.errors import MissingExtraError
+from edgeperc.errors import EdgepercError, MissingExtraError
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.pool import Lost
@@ -38,6 +38,7 @@ from edgeperc.system.ray_cluster import ENGINES
 from edgeperc.types.choices import VEHICLES
 
 from ..data.roads import CLASSES, VIEW, Z_RANGE_M, DatabaseError, read_coco
+from .coco import scans_of
 from .files import FARTHEST_M, FORMAT, N_FOLDS
 from .scenes import FOLDERS, INDEX, ROAD_FOLDERS, ROAD_INDEX, TRAIN, TRAINED, Job, Plan, SceneBuilder, inputs_of
 
@@ -83,7 +84,12 @@ def build(
     over the road model, of ``recipe`` if it is to be trained. Raises DatabaseError and the errors of models.
     """
     objects = KittiObjects(plan.kitti)
-    drawn = read_coco(polygons)
+    drawn, own = read_coco(polygons), dict[str, str]()
+    for name in drawn.keys() & objects.grades.keys():
+        with contextlib.suppress(EdgepercError, OSError, ValueError):  # reported when the scene itself is made
+            own[name] = scan_hash(objects.frame(name).points)
+    for path in polygons:
+        scans_of(path, own)
     held_back = TEST_DRIVES | set(test_drives)
     labeled = {name: objects.drives[name] for name in objects.grades}
     fold_of = folds(drive for drive in labeled.values() if drive not in held_back)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -15,12 +16,26 @@ import numpy as np
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.types.points import Bytes, Labels
 
-from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH
+from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH, DatabaseError
 from .files import TopViewDatabase, road_and_vehicles
 
 TURN_DEG = 8.0
 SMALLEST_M2 = 2.0
 SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
+
+
+def scans_of(path: Path, own: Mapping[str, str]) -> dict[str, str]:
+    """Scene -> hash of the scan that its road was drawn over, where a COCO file of `write_coco` has it. Raises
+    DatabaseError if one of its names is that of another scan here: ``own`` are the hashes of the scans by name.
+    """
+    images = json.loads(path.read_text())["images"]
+    scans = {Path(str(image.get("file_name"))).stem: str(image["scan"]) for image in images if "scan" in image}
+    if others := sorted(name for name, digest in scans.items() if own.get(name, digest) != digest):
+        raise DatabaseError(
+            f"{path} has roads that were drawn over other scans than those of these names here: {', '.join(others[:5])}"
+            "; names differ between copies of a set. Rename its images, or remove those that were drawn for other scans"
+        )
+    return scans
 
 
 def draft(labels: Labels) -> list[list[list[float]]]:

@@ -31,7 +31,7 @@ from edgeperc.system.fields import Fields
 from edgeperc.system.printable import printable
 
 from ..data.roads import HEIGHT, ROAD, WIDTH, DatabaseError, read_coco, write_coco
-from .coco import draft
+from .coco import draft, scans_of
 from .files import TopViewDatabase
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
@@ -70,8 +70,9 @@ class LabelServer(ThreadingHTTPServer):
         self.names = {*self.database.names}
         self.polygons, self.kitti = polygons, kitti
         self.lock = threading.Lock()
-        self.roads, self.drafts, scans = _polygons(polygons) if polygons.exists() else ({}, {}, {})
-        self.scans = scans | {row["scene"]: row["scan_sha256"] for row in self.database.rows}
+        self.roads, self.drafts = _polygons(polygons) if polygons.exists() else ({}, {})
+        self.scans = {row["scene"]: row["scan_sha256"] for row in self.database.rows}
+        self.scans |= scans_of(polygons, self.scans) if polygons.exists() else {}
         self.token = secrets.token_urlsafe(32)
         self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(("127.0.0.1", port), _Handler)
@@ -133,8 +134,8 @@ def _hang_up(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]], dict[str, str]]:
-    """Scene -> polygons, scene -> polygons of its draft, and scene -> hash of its scan."""
+def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+    """Scene -> polygons, and scene -> polygons of its draft."""
     roads = {}
     for name, segmentations in read_coco([path]).items():
         if not all(isinstance(each, list) for each in segmentations):
@@ -149,12 +150,11 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]], d
             f"{path} has annotations of {', '.join(others)}, which the page would drop when it saves; give a copy "
             "that has roads alone"
         )
-    scans = {Path(image["file_name"]).stem: image["scan"] for image in content["images"] if "scan" in image}
     try:
         drafts = {name: _clamped(rings) for name, rings in content.get("drafts", {}).items()}
     except (AttributeError, TypeError, _RefusedError) as exc:
         raise DatabaseError(f"{path} has drafts that are no polygons ({exc}); expected them by scene") from exc
-    return roads, {name: rings for name, rings in drafts.items() if rings and name not in roads}, scans
+    return roads, {name: rings for name, rings in drafts.items() if rings and name not in roads}
 
 
 class _RefusedError(Exception):

@@ -32,7 +32,7 @@ from shapely import Polygon
 
 import twins.database
 from cli_helpers import Shell
-from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import CardMismatchError
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
@@ -625,6 +625,14 @@ def test_notes_report_what_a_data_set_lacks(kitti: Path, model: str, polygons: P
     assert "000007" in report.notes[0]
     assert "frames.csv" in report.notes[1]
     assert TopViewDatabase(tmp_path / "out", "test").names == ["000002"]
+
+
+def test_roads_of_other_scans_are_refused(kitti: Path, model: str, tmp_path: Path) -> None:
+    scans = {"000001": scan_hash(KittiObjects(kitti).frame("000001").points), "000007": "0" * 16}
+    (tmp_path / "road.json").write_text(write_coco({name: [TRAPEZIUM] for name in scans}, scans))
+    with pytest.raises(DatabaseError, match="drawn over other scans than those of these names here: 000007;"):
+        build(plan_of(kitti, tmp_path / "out", model), polygons=[tmp_path / "road.json"], workers=1)
+    assert not (tmp_path / "out").exists()
 
 
 def test_polygons_and_run_lengths_become_masks(tmp_path: Path) -> None:

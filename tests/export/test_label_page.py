@@ -169,6 +169,10 @@ def test_a_file_that_cannot_be_edited_is_refused(server: LabelServer, out: Path,
         server.polygons.write_text(json.dumps(content | {"drafts": drafts}))
         with pytest.raises(DatabaseError, match="drafts that are no polygons"):
             LabelServer(out, server.polygons)
+    content["images"][0]["scan"] = "0" * 16
+    server.polygons.write_text(json.dumps(content))
+    with pytest.raises(DatabaseError, match=r"drawn over other scans .* here: 000003; names differ"):
+        LabelServer(out, server.polygons)
     runs = {"size": [400, 200], "counts": [80_000]}
     for change, said in (({"segmentation": runs}, "run lengths"), ({"category_id": 1}, "annotations of background")):
         (tmp_path / "other.json").write_text(drawn(annotation=change))
