@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
     from ..types.mounting import Mounting
     from ..types.perception import Perception
-    from ..types.points import Points
+    from ..types.points import Floats, Points
     from ..types.sensor import SensorProfile
 
 
@@ -131,8 +131,8 @@ def add_parser(commands: Commands) -> None:
     )
     reading(
         "--poses FILE",
-        "poses of the sensor on the clock of the scans, for --deskew: lines of time [s], x, y, z [m] and the "
-        "quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
+        "poses of the sensor on the clock of the scans, for --deskew and, with it, --track: lines of time [s], x, y, z "
+        "[m] and the quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
     )
     reading(
         "--quaternion",
@@ -598,8 +598,12 @@ class _Run:
         under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
         return name, perception, tracks, under
 
-    def _pose(self, perception: Perception) -> list[list[float]] | None:
-        """Pose of a sensor whose place in a map is known, seen from that of the first scan; its axes are the map's."""
+    def _pose(self, perception: Perception) -> Floats | list[list[float]] | None:
+        """Pose of the sensor, seen from that of the first scan: by ``--poses``, or where its place in a map is known,
+        whose axes are then its own.
+        """
+        if self._straightener is not None and self._straightener.pose is not None:
+            return self._straightener.pose
         if perception.origin_m is None:
             return None
         self._first_place = self._first_place or perception.origin_m

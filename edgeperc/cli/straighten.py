@@ -19,6 +19,8 @@ class Straightener:
 
     def __init__(self, trajectory: Trajectory | None) -> None:
         self._trajectory = trajectory
+        self._begin: Floats | None = None  # pose of the first scan
+        self.pose: Floats | None = None  # that of the last scan, seen from the first one; None without a trajectory
         self._tracked: list[Tracks] = []
 
     def straighten(
@@ -35,6 +37,7 @@ class Straightener:
             )
         known = times_s[np.isfinite(times_s)]
         if not len(known):
+            self._place(stamp_s)
             return points
         first_s, last_s = float(known.min()), float(known.max())
         if self._trajectory is not None:
@@ -54,11 +57,18 @@ class Straightener:
         beside_s = last_s - first_s
         is_near = stamp_s is not None and first_s - beside_s <= stamp_s <= last_s + beside_s
         at_s = stamp_s if is_near else last_s
+        self._place(at_s)
         scan = points if sensor is None else returns(points, sensor)[0]
         straight = deskew(scan, times_s, motion, at_s=at_s)
         dropped = np.isnan(scan[:, 0])
         straight[dropped] = points[dropped]
         return straight
+
+    def _place(self, at_s: float | None) -> None:
+        if self._trajectory is not None and at_s is not None:
+            pose = self._trajectory.pose(at_s)
+            self._begin = pose if self._begin is None else self._begin
+            self.pose = np.linalg.inv(self._begin) @ pose
 
     def follow(self, tracks: Tracks) -> None:
         """Take the tracks of the last scan, for the motion during the next one. Motion needs two of one session."""

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.fields import Fields
 from ..system.kernels import njit
-from ..types.frame import fill_moved, poses_of
+from ..types.frame import fill_moved, pose_between, poses_of, quaternion
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import numbers_of, rigid
@@ -249,6 +249,25 @@ class Trajectory:
             The times are not finite, or more than 0.2 s outside those of the poses; or the poses around them are more
             than 2 s and 1 m apart.
         """
+        before, after = self._around(first_s, last_s)
+        poses, (begin_s, end_s) = self.T_world_sensor[[before, after]], self.times_s[[before, after]].tolist()
+        return Motion.between(poses[0], begin_s, poses[1], end_s)
+
+    def pose(self, at_s: float) -> Floats:
+        """T_world_sensor (4, 4) at a time [s], between the poses around it, such as for a `Tracker` or a `RollingGrid`.
+
+        Raises
+        ------
+        StampError
+            As `motion`, of a scan at this time.
+        """
+        before, after = self._around(at_s, at_s)
+        begin_s, end_s = self.times_s[[before, after]].tolist()
+        first, second = ((T[:3, 3], np.array(quaternion(T[:3, :3]))) for T in self.T_world_sensor[[before, after]])
+        return pose_between(first, second, (at_s - begin_s) / (end_s - begin_s))
+
+    def _around(self, first_s: float, last_s: float) -> tuple[int, int]:
+        """The last pose before a scan and the first one after it; errors as `motion`."""
         begin, end = float(self.times_s[0]), float(self.times_s[-1])
         if not begin - OUTSIDE_S <= first_s <= last_s <= end + OUTSIDE_S:
             raise StampError(
@@ -264,7 +283,7 @@ class Trajectory:
                     f"there is no pose from {times_s[k]:.3f} to {times_s[k + 1]:.3f} s, and the sensor moved; expected "
                     f"poses at most {LONGEST_GAP_S:g} s apart around the scan of {first_s:.3f}..{last_s:.3f} s"
                 )
-        return Motion.between(poses[0], float(times_s[0]), poses[-1], float(times_s[-1]))
+        return before, after
 
 
 def deskew(

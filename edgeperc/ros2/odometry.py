@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import OptionError, PointsError, TrackingError
 from ..road.rolling import RollingGrid
-from ..types.frame import poses_of
+from ..types.frame import pose_between
 from ..types.mounting import Mounting
 from ..types.points import Floats
 from ..types.rigid import rigid
@@ -96,9 +96,7 @@ class Poses:
                 return None
             (ns, place, turn), (later_ns, later_place, later_turn) = (*self._poses[k - 1 : k + 1], self._poses[-1])[:2]
         share = (stamp_ns - ns) / (later_ns - ns) if later_ns > ns else 0.0
-        near = later_turn if turn @ later_turn >= 0.0 else -later_turn
-        turned = _unit((1.0 - share) * turn + share * near)
-        (pose,) = poses_of(((1.0 - share) * place + share * later_place)[None], turned[None])
+        pose = pose_between((place, turn), (later_place, later_turn), share)
         return rigid("the odometry's pose", pose, TrackingError)
 
 
@@ -108,8 +106,4 @@ def _parts(pose: Any) -> tuple[Floats, Floats]:
     turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
     if not (np.isfinite(place).all() and abs(np.linalg.norm(turn) - 1.0) < 1e-2):
         raise TrackingError(f"got the place {place} and the quaternion {turn}; expected finite numbers of length 1")
-    return place, _unit(turn)
-
-
-def _unit(turn: Floats) -> Floats:
-    return np.asarray(turn / np.linalg.norm(turn), np.float64)
+    return place, np.asarray(turn / np.linalg.norm(turn), np.float64)

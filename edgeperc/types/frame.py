@@ -113,6 +113,15 @@ def poses_of(positions: Floats, quaternions: Floats) -> Floats:
     return poses
 
 
+def pose_between(first: tuple[Floats, Floats], second: tuple[Floats, Floats], share: float) -> Floats:
+    """Matrix (4, 4) at a share of the way between two poses: positions (3,) and unit quaternions x, y, z, w (4,)."""
+    (place, turn), (later_place, later_turn) = first, second
+    near = later_turn if turn @ later_turn >= 0.0 else -later_turn
+    turned = (1.0 - share) * turn + share * near
+    (pose,) = poses_of(((1.0 - share) * place + share * later_place)[None], (turned / np.linalg.norm(turned))[None])
+    return np.asarray(pose, np.float64)
+
+
 def _moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Floats32:
     scan = as_points(points)
     if motion is None:

@@ -159,6 +159,8 @@ def test_poses_are_read_as_they_were_written(rate: Any, velocity: Any) -> None:
         motion = found.motion(first_s, last_s)
         np.testing.assert_allclose(motion.velocity_mps, velocity, atol=1e-9)
         np.testing.assert_allclose(motion.rate_radps, np.array(rate) / 3.0, atol=1e-9)
+    for k, pose in enumerate(poses):
+        np.testing.assert_allclose(found.pose(10.0 + 0.5 * k), pose, atol=1e-9)
 
 
 def test_the_poses_around_a_scan_count() -> None:
@@ -169,6 +171,7 @@ def test_the_poses_around_a_scan_count() -> None:
     drive = Trajectory(np.arange(4.0), poses)
     assert [drive.motion(t, t + 0.1).velocity_mps[0] for t in (0.2, 1.0, 1.5, 1.9, 2.0)] == [0, 10, 10, 10, 0]
     assert drive.motion(0.95, 1.05).velocity_mps[0] == pytest.approx(5.0)
+    assert [drive.pose(t)[0, 3] for t in (0.5, 1.25, 2.0, 3.1)] == pytest.approx([0.0, 2.5, 10.0, 10.0])
     gaps = Trajectory(np.arange(4.0) * 3.0, poses)  # no pose for 3 s
     assert gaps.motion(1.0, 1.1).velocity_mps[0] == 0.0
     with pytest.raises(StampError, match=r"no pose from 3\.000 to 6\.000 s, and the sensor moved"):

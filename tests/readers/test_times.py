@@ -23,7 +23,7 @@ from test_motion import write_tum
 import edgeperc
 import twins.motion
 from cli_helpers import Shell, run
-from edgeperc import Motion, TimedScan, Trajectory, accumulate, deskew, read_timed_scans
+from edgeperc import Motion, TimedScan, Tracker, Trajectory, accumulate, deskew, read_timed_scans
 from edgeperc.cli.straighten import Straightener
 from edgeperc.errors import OptionError, PointsError, StampError
 from edgeperc.readers.times import of_plausible_duration, point_times, time_name
@@ -411,13 +411,24 @@ def test_scans_without_times_are_not_straightened() -> None:
     assert Straightener(None).straighten(1.0, points, np.full(8, np.nan)) is points
 
 
-def test_a_scan_that_the_poses_do_not_cover_fails_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scan_that_the_poses_do_not_cover_fails_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others are tracked by the poses: what stands was said to drive, at the error of the tracker's estimate."""
     pytest.importorskip("onnxruntime")
     path = drive(tmp_path / "drive.bag", [1700.0, 1800.0, 1700.2])
     times = 1699.5 + 0.1 * np.arange(10)
     write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
-    options = ["--sensor", "hdl-64e", "--on-mismatch", "ignore", "--model", "pointseg", "--json"]
+    options = ["--sensor", "hdl-64e", "--on-mismatch", "ignore", "--model", "pointseg", "--json", "--track"]
+    update, poses = Tracker.update, list[Any]()
+
+    def recorded(tracker: Tracker, boxes: Any, stamp_s: float, pose: Any = None, **how: Any) -> Any:
+        poses.append(pose)
+        return update(tracker, boxes, stamp_s, pose, **how)
+
+    monkeypatch.setattr(Tracker, "update", recorded)
     assert run("run", path, "--deskew", "--poses", tmp_path / "poses.txt", *options) == 1
+    np.testing.assert_allclose(poses[-2:], [np.eye(4), np.linalg.inv(pose_at(0.5)) @ pose_at(0.7)], atol=1e-6)
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert ["error" in answer for answer in answers] == [False, False, True]  # the bag's messages come by time
 
