@@ -211,12 +211,12 @@ class _ScanWorker:
         self._perceive, self._run, self._files = alone(arguments)
         self._learned = learned
         self._report = Report(arguments, {})
-        state = (learned.mounting.mounting(), learned.mounting.n_scans, learned.remission.matched, learned.to_check)
+        state = learned.mounting.mounting(), learned.mounting.n_scans, learned.remission.matched, learned.to_check
         options = {name: value for name, value in sorted(vars(arguments).items()) if name not in _OTHERS}
         perceiver = self._perceive
         # The sensor as it is: its file, or that of its mounting, may have changed since an earlier run.
         named = perceiver.cards, perceiver.sensor, dict(perceiver.providers)
-        self._made_of = repr((__version__, *named, state, options))
+        self._made_of = repr((__version__, *named, state, learned.normal, options))
 
     def __call__(self, item: tuple[Path | Remote, Path | Remote, Path | Remote]) -> _Answer:
         name, path, target = item

@@ -9,9 +9,11 @@ import os
 import shutil
 import subprocess
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.request import Request, urlopen
 
@@ -24,12 +26,16 @@ from edgeperc.cli import side_by_side
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.scans import Sensors
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
-from edgeperc.perceiver import Perceiver
+from edgeperc.ground.leveling import MountingEstimator
+from edgeperc.perceiver import Learned, Perceiver
+from edgeperc.preprocess.health import Normal
+from edgeperc.preprocess.remission import RemissionMatcher
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.system.pool import Lost
 from edgeperc.system.ray_cluster import map_on_ray, signals_kept
 from edgeperc.system.remote import Remote, location
+from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import get_sensor
 from scenes import urban
 
@@ -155,6 +161,18 @@ def test_what_workers_have_made_is_kept(scans: Path, alone: Any, here: None, tmp
     for ego_box in (None, ((-9.0, 9.0), (-9.0, 9.0), (-1.0, 2.0))):
         profile.write_text(replace(get_sensor("hdl-64e"), ego_box=ego_box).to_json())
         assert "kept" not in run(*arguments, "--sensor", profile)[2]
+
+
+def test_what_is_kept_was_made_after_the_same_first_scans() -> None:
+    """With a known mounting and remission, only the health shows that they are others."""
+    perceiver = SimpleNamespace(cards=(), sensor=None, providers={})
+    known = MountingEstimator(MODEL_MOUNTING), RemissionMatcher(get_sensor("hdl-64e")), 0, True, None
+    made = set()
+    for normal in (Normal(), Normal(np.zeros((72, 4))), Normal(np.ones((72, 4)))):
+        learned = Learned(*known, normal)
+        worker = side_by_side._ScanWorker(lambda _: (perceiver, None, None), Namespace(json=True), learned)
+        made.add(worker._made_of)
+    assert len(made) == 3
 
 
 def figures(file: Path, *options: str) -> tuple[Any, list[str]]:
