@@ -169,7 +169,7 @@ def _perceive_one_sensor(
     ]
     made_of = alone, argparse.Namespace(**options), learned
     perceived_by = ENGINES[arguments.engine]
-    answers = perceived_by(_ScanWorker, made_of, items, workers=arguments.workers, n_threads=n_threads)
+    answers = perceived_by(ScanWorker, made_of, items, workers=arguments.workers, n_threads=n_threads)
     reported: set[str] = set()
     n_kept = 0
     for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
@@ -204,7 +204,7 @@ def _said_once(answer: _Answer, reported: set[str]) -> str:
     return text
 
 
-class _ScanWorker:
+class ScanWorker:
     """Perceives scan files in a worker process, each from the same state."""
 
     def __init__(self, alone: Alone, arguments: argparse.Namespace, learned: Learned) -> None:
@@ -216,13 +216,13 @@ class _ScanWorker:
         perceiver = self._perceive
         # The sensor as it is: its file, or that of its mounting, may have changed since an earlier run.
         named = perceiver.cards, perceiver.sensor, dict(perceiver.providers)
-        self._made_of = repr((__version__, *named, state, learned.normal, options))
+        self.made_of = repr((__version__, *named, state, learned.normal, options))
 
     def __call__(self, item: tuple[Path | Remote, Path | Remote, Path | Remote]) -> _Answer:
         name, path, target = item
         files = self._files(target)
         record = target.parent / ".run" / f"{target.name}.json"
-        made_of = hashlib.sha256(f"{self._made_of} {name} {_stamp(path)}".encode()).hexdigest()
+        made_of = hashlib.sha256(f"{self.made_of} {name} {_stamp(path)}".encode()).hexdigest()
         if files and (recorded := _kept(record, made_of, files)) is not None:
             return recorded
         self._perceive.start_from(self._learned)

@@ -250,8 +250,8 @@ class Trajectory:
             than 2 s and 1 m apart.
         """
         before, after = self._around(first_s, last_s)
-        poses, (begin_s, end_s) = self.T_world_sensor[[before, after]], self.times_s[[before, after]].tolist()
-        return Motion.between(poses[0], begin_s, poses[1], end_s)
+        poses, times_s = self.T_world_sensor, self.times_s
+        return Motion.between(poses[before], float(times_s[before]), poses[after], float(times_s[after]))
 
     def pose(self, at_s: float) -> Floats:
         """T_world_sensor (4, 4) at a time [s], between the poses around it, such as for a `Tracker` or a `RollingGrid`.
@@ -261,9 +261,9 @@ class Trajectory:
         StampError
             As `motion`, of a scan at this time.
         """
-        before, after = self._around(at_s, at_s)
-        begin_s, end_s = self.times_s[[before, after]].tolist()
-        first, second = ((T[:3, 3], np.array(quaternion(T[:3, :3]))) for T in self.T_world_sensor[[before, after]])
+        around = [*self._around(at_s, at_s)]
+        begin_s, end_s = self.times_s[around].tolist()
+        first, second = ((T[:3, 3], np.array(quaternion(T[:3, :3]))) for T in self.T_world_sensor[around])
         return pose_between(first, second, (at_s - begin_s) / (end_s - begin_s))
 
     def _around(self, first_s: float, last_s: float) -> tuple[int, int]:

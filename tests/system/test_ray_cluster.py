@@ -27,9 +27,8 @@ from edgeperc.cli.main import build_parser
 from edgeperc.cli.scans import Sensors
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
 from edgeperc.ground.leveling import MountingEstimator
-from edgeperc.perceiver import Learned, Perceiver
+from edgeperc.perceiver import Perceiver
 from edgeperc.preprocess.health import Normal
-from edgeperc.preprocess.remission import RemissionMatcher
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.system.pool import Lost
@@ -165,14 +164,13 @@ def test_what_workers_have_made_is_kept(scans: Path, alone: Any, here: None, tmp
 
 def test_what_is_kept_was_made_after_the_same_first_scans() -> None:
     """With a known mounting and remission, only the health shows that they are others."""
-    perceiver = SimpleNamespace(cards=(), sensor=None, providers={})
-    known = MountingEstimator(MODEL_MOUNTING), RemissionMatcher(get_sensor("hdl-64e")), 0, True, None
-    made = set()
-    for normal in (Normal(), Normal(np.zeros((72, 4))), Normal(np.ones((72, 4)))):
-        learned = Learned(*known, normal)
-        worker = side_by_side._ScanWorker(lambda _: (perceiver, None, None), Namespace(json=True), learned)
-        made.add(worker._made_of)
-    assert len(made) == 3
+    perceiver: Any = SimpleNamespace(cards=(), sensor=None, providers={})
+    known = {"mounting": MountingEstimator(MODEL_MOUNTING), "remission": SimpleNamespace(matched=None), "to_check": 0}
+    made = []
+    for normal in (Normal(), Normal(np.zeros((72, 4)))):
+        learned: Any = SimpleNamespace(**known, normal=normal)
+        made.append(side_by_side.ScanWorker(lambda _: (perceiver, None, None), Namespace(json=True), learned).made_of)
+    assert made[0] != made[1]
 
 
 def figures(file: Path, *options: str) -> tuple[Any, list[str]]:
