@@ -6,12 +6,14 @@ then show the readme with links into it.
 
 import os
 import re
+import sysconfig
 from pathlib import Path
 
 from setuptools import Distribution, setup
 
 NUMBA = "numba>=0.59,<0.69"
-HAS_KERNELS = any(file.suffix in (".so", ".pyd") for file in Path("edgeperc/system/compiled").glob("*"))
+# Those that another Python or processor left in a checkout are none for this one.
+HAS_KERNELS = any(Path("edgeperc/system/compiled").glob(f"*{sysconfig.get_config_var('EXT_SUFFIX')}"))
 # Such as https://github.com/OWNER/NAME, without a slash at its end; empty: no addresses, and links as in the checkout.
 REPOSITORY = os.environ.get("EDGEPERC_REPOSITORY", "")
 

@@ -6,11 +6,13 @@ import ast
 import email
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from sysconfig import get_config_var
 from typing import Any
 
 import pytest
@@ -159,14 +161,17 @@ def test_the_container_is_slim_and_has_no_privileges() -> None:
     assert {*extras.split(",")} <= EXTRAS
 
 
-def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
+def given_to_the_container() -> set[str]:
     lines = (REPOSITORY / ".containerignore").read_text("utf-8").splitlines()
-    kept = {line[1:] for line in lines if line.startswith("!")}
     assert lines[1] == "*"
+    return {line[1:] for line in lines if line.startswith("!")}
+
+
+def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
     folders = {path.partition("/")[0] for path in SETUPTOOLS["package-dir"].values()}
-    files = {"pyproject.toml", "MANIFEST.in", "README.md", *PROJECT["license-files"]}
-    assert kept == folders | files
-    assert (REPOSITORY / ".dockerignore").read_text("utf-8") == "\n".join(lines) + "\n"
+    files = {"pyproject.toml", "setup.py", "MANIFEST.in", "README.md", *PROJECT["license-files"]}
+    assert given_to_the_container() == folders | files
+    assert (REPOSITORY / ".dockerignore").read_bytes() == (REPOSITORY / ".containerignore").read_bytes()
 
 
 @pytest.mark.parametrize("is_repository", [True, False])
@@ -194,7 +199,7 @@ REPOSITORIES = ["https://example.org/some/one", "https://git.example.org/lidar/e
 @pytest.mark.parametrize("repository", REPOSITORIES)
 def test_a_release_names_its_repository(repository: str, tmp_path: Path) -> None:
     """All addresses, and the links of the readme, come from one variable; without it there are none."""
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "edgeperc", "models", "bench", "export"):
+    for name in given_to_the_container():
         (tmp_path / name).symlink_to(REPOSITORY / name)
     code = "from setuptools.build_meta import prepare_metadata_for_build_wheel as made; made('.')"
     environment = {**os.environ, "EDGEPERC_REPOSITORY": repository}
@@ -219,6 +224,24 @@ def test_a_release_names_its_repository(repository: str, tmp_path: Path) -> None
         in readme
     )
     assert f"[Quick start]({repository}/blob/v{version}/docs/quickstart.md)" in readme
+
+
+@pytest.mark.parametrize(("suffix", "needs_numba"), [(get_config_var("EXT_SUFFIX"), False), (".cpython-39.so", True)])
+def test_only_kernels_for_this_python_replace_numba(
+    suffix: str, needs_numba: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a checkout, from which another Python or a container installs the package."""
+    monkeypatch.delenv("EDGEPERC_REPOSITORY", raising=False)
+    for file in ("README.md", f"edgeperc/system/compiled/kernels_x86_64_v3{suffix}"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    monkeypatch.chdir(tmp_path)
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("setuptools.setup", given.update)
+    runpy.run_path(str(REPOSITORY / "setup.py"))
+    assert ("numba" in requirements(given["install_requires"])) == needs_numba
+    for file, what in (("MANIFEST.in", "prune "), (".containerignore", "")):
+        assert f"{what}edgeperc/system/compiled" in (REPOSITORY / file).read_text("utf-8").splitlines()
 
 
 def test_the_workflow_names_its_repository() -> None:
