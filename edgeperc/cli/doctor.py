@@ -170,8 +170,9 @@ def installed(prefix: str = "") -> dict[str, str]:
 
 
 def find_packages() -> Iterator[Finding]:
-    """Python, numpy, numba and the one build of onnxruntime."""
-    for name in ("numpy", "numba", "llvmlite"):
+    """numpy, numba and the one build of onnxruntime."""
+    # Compiled kernels need no numba. Where it is needed and missing, `_kernels` and `find_extras` say so.
+    for name in ("numpy", *filter(find_spec, ("numba", "llvmlite"))):
         try:
             yield Finding(name, "ok", str(import_module(name).__version__))
         except Exception as exc:  # a wheel for another processor or numpy raises other errors than ImportError
@@ -212,6 +213,7 @@ def has_sme() -> bool:
 def _kernels() -> Iterator[Finding]:
     import numpy as np
 
+    from ..system.kernels import Kernel
     from ..types.frame import fill_moved
     from ..types.points import read_only
 
@@ -222,7 +224,11 @@ def _kernels() -> Iterator[Finding]:
     if moved.tolist() != [[2.0, 2.0, 2.0, 1.0]]:
         yield Finding("kernels", "broken", f"a kernel gave {moved.tolist()}", "pip install --force-reinstall numba")
         return
-    cache = getattr(fill_moved, "_cache", None)
+    by_numba = fill_moved.by_numba if isinstance(fill_moved, Kernel) else fill_moved
+    if by_numba is None:
+        yield Finding("kernels", "ok", f"compiled when the package was built; loaded in {took_s:.1f} s")
+        return
+    cache = getattr(by_numba, "_cache", None)
     place = None if cache is None else cache.cache_path
     compiled = f"compiled or loaded in {took_s:.1f} s"
     if place is None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from email.message import Message
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +21,8 @@ from edgeperc.cli import doctor
 from edgeperc.errors import ProviderError
 from edgeperc.inference import providers
 from edgeperc.system.kernel_cache import KernelCache
+from edgeperc.system.kernels import Kernel
+from edgeperc.types import frame
 
 posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
 
@@ -82,6 +85,18 @@ def test_a_package_that_cannot_be_imported(package: str, tmp_path: Path) -> None
     if package == "onnxruntime":
         assert broken(found) == {"onnxruntime"}
         assert found["model ssadnet.onnx"]["state"] == "ok"
+
+
+def test_compiled_kernels_need_no_numba(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    function = frame.fill_moved.py_func
+    forms = SimpleNamespace(get=lambda kinds, default: function)
+    library: Any = SimpleNamespace(functions_of=lambda kernel: forms)
+    monkeypatch.setattr(frame, "fill_moved", Kernel(library, {}, function))
+    for package in ("numba", "llvmlite"):
+        monkeypatch.setitem(sys.modules, package, None)
+    found = report(shell, 0)
+    assert "numba" not in found
+    assert found["kernels"]["found"].startswith("compiled when the package was built")
 
 
 def test_no_onnxruntime(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
