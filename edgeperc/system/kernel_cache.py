@@ -220,7 +220,8 @@ class KernelCache:
 
     def _key(self, sig: Any, codegen: Any) -> tuple[str, Any]:
         """The file's name for a signature; and the types that it is for."""
-        function, tag = self._function, sys.implementation.cache_tag
+        # Under -OO, the code has no docstrings, and another stamp.
+        function, tag = self._function, f"{sys.implementation.cache_tag}.opt-{sys.flags.optimize}"
         known = _numba.sigutils.normalize_signature(sig)
         processor = codegen.magic_tuple()
         what = repr((function.__qualname__, *map(str, known), processor, tag, settings())).encode()

@@ -41,6 +41,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit`: the decorator of every kernel; options as there."""
     library = _library()
     if library is None:
+        require("numba", "jit", "edgeperc, without compiled kernels for this Python and processor,")
         from .kernel_cache import njit as jit
 
         return jit(**options)
@@ -81,7 +82,7 @@ class Kernel:
         update_wrapper(self, function)
         self.library = library
         self._functions: dict[object, Callable[..., Any]] | None = None
-        self._dispatcher: Any = None
+        self.by_numba: Any = None  # once it was needed
 
     def __call__(self, *args: Any) -> Any:
         """Call the compiled form for these types."""
@@ -97,13 +98,14 @@ class Kernel:
     @property
     def dispatcher(self) -> Any:
         """The same kernel by numba, for types that the library does not have."""
-        if self._dispatcher is None:
-            require("numba", "jit", f"{self.__module__}.{self.__name__}, with arguments of unusual types,")
+        if self.by_numba is None:
+            why = "with arguments of unusual types" if self._functions else "whose code was not compiled"
+            require("numba", "jit", f"{self.__module__}.{self.__name__}, {why},")
             from .kernel_cache import njit as jit
 
             _teach_numba()
-            self._dispatcher = jit(**self.options)(self.py_func)
-        return self._dispatcher
+            self.by_numba = jit(**self.options)(self.py_func)
+        return self.by_numba
 
     def _compile(self, *args: Any) -> Any:
         logger.info("%s.%s has no compiled form for %s", self.__module__, self.__name__, [*map(kind_of, args)])
@@ -111,7 +113,7 @@ class Kernel:
 
 
 class Library:
-    """A library of compiled kernels and its index: digest of each one's code, and its functions by types."""
+    """A library of compiled kernels and its index: digests of each one's code, and its functions by types."""
 
     def __init__(self, module: Any, index: Mapping[str, Any]) -> None:
         self._module, self._index = module, index
@@ -121,7 +123,7 @@ class Library:
         from .kernel_stamp import code_of
 
         entry = self._index.get(f"{kernel.__module__}.{kernel.__name__}")
-        if entry is None or entry["code"] != code_of(kernel).hex():
+        if entry is None or code_of(kernel).hex() not in entry["codes"]:
             return {}
         return {tuple(map(read_kind, kinds)): getattr(self._module, name) for name, kinds in entry["forms"].items()}
 

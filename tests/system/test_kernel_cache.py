@@ -540,13 +540,19 @@ def test_a_kernel_sees_what_other_modules_define(package: Path, imported_anew: C
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("BOUNDSCHECK", 1), ("OPT", type(numba.config.OPT)(1)), ("CPU_NAME", "generic")]
+    ("owner", "name", "value"),
+    [
+        (numba.config, "BOUNDSCHECK", 1),
+        (numba.config, "OPT", type(numba.config.OPT)(1)),
+        (numba.config, "CPU_NAME", "generic"),
+        (sys, "flags", SimpleNamespace(optimize=2, dont_write_bytecode=1)),
+    ],
 )
-def test_settings_of_numba_and_processors_have_files_of_their_own(
-    place: Place, monkeypatch: pytest.MonkeyPatch, name: str, value: object
+def test_settings_and_processors_have_files_of_their_own(
+    place: Place, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, value: object
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(numba.config, name, value)
+        patch.setattr(owner, name, value)
         assert place.start() == ([], 2)
         assert place.start() == ([], 0)
     assert place.start() == ([], 0)
