@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from edgeperc.system.extras import require
 from edgeperc.types.points import Floats32
+
+njit = require("numba", "peers", "edgeperc-bench peers").njit
 
 CELL_M = 0.16
 LOWEST_M, HIGHEST_M = -3.0, 1.0

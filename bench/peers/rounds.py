@@ -6,12 +6,12 @@ import argparse
 import platform
 from collections.abc import Callable, Mapping
 
-import numba
 import numpy as np
 
 from edgeperc.cli.arguments import Options, options
 from edgeperc.types.points import Floats
 
+from ..context import version_of
 from ..samples import elapsed_ms
 
 N_WARM_UP = 3
@@ -31,7 +31,7 @@ def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[st
 
 def versions(**others: str) -> str:
     """Versions of numpy, numba, Python and other packages, and the processor's architecture."""
-    packages = {"numpy": np.__version__, "numba": numba.__version__, "Python": platform.python_version()} | others
+    packages = {"numpy": np.__version__, "numba": version_of("numba"), "Python": platform.python_version()} | others
     return ", ".join([*(f"{name} {version}" for name, version in packages.items()), platform.machine()])
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from edgeperc.system.kernel_cache import njit
+from edgeperc.system.kernels import njit
 from edgeperc.types.geometry import pair_iou
 from edgeperc.types.points import Floats
 from edgeperc.types.views import ObjectGeometry
