@@ -9,9 +9,11 @@ import numpy as np
 
 import edgeperc
 from edgeperc.cli import main
+from edgeperc.inference.decode import decode_classes
 from edgeperc.inference.pillars import Pillarizer
 from edgeperc.readers.livox_packets import NEW_KINDS, LivoxStream, Points
 from edgeperc.readers.ouster_packets import OusterStream, layout_of
+from edgeperc.readers.pcd import fill_unpacked_lzf
 from edgeperc.readers.spinning_packets import FORMATS, Angles, SpinningStream
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import InputSpec
@@ -34,11 +36,34 @@ def decode_packets() -> None:
     list(livox.add(Points(0.0, 0.0, NEW_KINDS[1], bytes(14)))) + list(livox.end())
 
 
+def see_images() -> None:
+    """Label an image, paint a scan and the road by it, as `--camera` and programs do."""
+    points = simulated_scan(1, "hdl-64e").points
+    seen = edgeperc.Perceiver("camseg")(image=np.zeros((90, 160, 3), np.uint8))
+    K = [[100.0, 0.0, 80.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]]
+    T = [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    calibration = edgeperc.Calibration(np.array(K), np.array(T), 160, 90)
+    edgeperc.paint(seen, points, calibration, sensor="hdl-64e")
+    edgeperc.camera_road(seen, points, calibration, sensor="hdl-64e")
+    calibration.project(points)
+
+
+def move_and_read() -> None:
+    """Undo motion, watch a zone, read a compressed cloud, and take scores of classes from logits."""
+    points = simulated_scan(1).points
+    edgeperc.deskew(points, np.zeros(len(points)), edgeperc.Motion((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    edgeperc.Zone([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]).mark(points)
+    fill_unpacked_lzf(np.frombuffer(bytes(2), np.uint8), np.empty(1, np.uint8))
+    decode_classes(np.zeros((2, 4, 4), np.float32), "class_logits")
+
+
 def run() -> None:
     """Perceive, track and map simulated scans in every usual set-up, run the demo, find a sensor and its place."""
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
     decode_packets()
+    see_images()
+    move_and_read()
     edgeperc.find_origin(simulated_scan(1, "hdl-64e").points[:, :3] + [0.0, 5e6, 0.0])
     view = PillarGeometry((0.0, 64.0), (-32.0, 32.0), (-3.0, 1.0), 0.5, 8, 100, 0.0, 0.0, "num_points", "coors")
     Pillarizer(view, InputSpec("voxels", ("x", "range"), (0.0, 0.0), (1.0, 1.0))).fill(simulated_scan(1).points)
