@@ -43,6 +43,7 @@ for kernel in pathlib.Path("edgeperc").rglob("*.kernel"):
 END
 cd "$away"
 "$away/venv/bin/python" -c "import edgeperc; assert edgeperc.__file__.startswith('$away'), edgeperc.__file__"
+"$away/venv/bin/edgeperc" doctor
 "$away/venv/bin/edgeperc" demo --out demo
 [ -n "$(find demo -name '*.png' -size +1k)" ] || { echo "the demo made no picture in $away/demo"; exit 1; }
 echo "The wheel works outside the checkout: $(du -h "$wheel" | cut -f1), $(find demo -type f | tr '\n' ' ')"

@@ -539,13 +539,16 @@ def test_a_kernel_sees_what_other_modules_define(package: Path, imported_anew: C
     assert imported_anew() == (1.25, 1)
 
 
+WITHOUT_DOCSTRINGS = SimpleNamespace(**{name: getattr(sys.flags, name) for name in dir(sys.flags)} | {"optimize": 2})
+
+
 @pytest.mark.parametrize(
     ("owner", "name", "value"),
     [
         (numba.config, "BOUNDSCHECK", 1),
         (numba.config, "OPT", type(numba.config.OPT)(1)),
         (numba.config, "CPU_NAME", "generic"),
-        (sys, "flags", SimpleNamespace(optimize=2, dont_write_bytecode=1)),
+        (sys, "flags", WITHOUT_DOCSTRINGS),
     ],
 )
 def test_settings_and_processors_have_files_of_their_own(
