@@ -20,10 +20,10 @@ from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.ceiling import find_ceiling
 from .ground.leveling import MountingEstimate, MountingEstimator, near_support, share_below
-from .inference.networks import Networks
 from .inference.object_network import BoxesFrom, ObjectNetwork
 from .inference.pillar_network import PillarNetwork
 from .inference.session import Session
+from .inference.sessions import Sessions
 from .objects.boxes import MIN_SCORE
 from .pipeline import Options, Parts, Pipeline, RangeImageNetwork, TopViewNetwork
 from .preprocess import findings
@@ -339,7 +339,7 @@ class Perceiver:
         load = partial(
             Session, provider=provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted
         )
-        self._networks = Networks(wanted, precision, load)
+        self._sessions = Sessions(wanted, precision, load)
         self._load(self.sensor)
         views = [card.view.kind for card in self.cards]
         if len(views) != len(set(views)):
@@ -371,7 +371,7 @@ class Perceiver:
     def _load(self, sensor: SensorProfile) -> None:
         """Load the networks of a sensor."""
         own = vars(self)
-        own["sessions"] = sessions = self._networks.of(sensor)
+        own["sessions"] = sessions = self._sessions.of(sensor)
         own["cards"] = tuple(session.card for session in sessions)
         own["providers"] = MappingProxyType({session.card.name: session.description for session in sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]

@@ -68,7 +68,7 @@ FLOORS = {
         inference.__init__ inference.box_heads inference.crop inference.pillars inference.projection inference.providers
         inference.decode inference.detections inference.listing
         inference.session
-        inference.object_network inference.pillar_network
+        inference.object_network inference.pillar_network inference.sessions
         road.__init__ road.around road.outline
         road.ahead road.grid
         road.rolling
@@ -146,7 +146,7 @@ FLOORS = {
         training.train
         training.ablation training.camvid
         release.__init__ release.int8_graph release.models_page release.object_graph release.object_parity
-        release.triton_model
+        release.thinned release.triton_model
         release.to_onnx release.triton
         release.agree release.quantize
         release.object_int8

@@ -37,7 +37,7 @@ from edgeperc import (
     StampError,
     pipeline,
 )
-from edgeperc.inference import networks, providers, session
+from edgeperc.inference import providers, session, sessions
 from edgeperc.objects.boxes import weigh
 from edgeperc.pipeline import Pipeline
 from edgeperc.simulation.drawn import random_scene
@@ -782,8 +782,8 @@ def test_a_sparse_sensor_has_weights_of_its_own(model: str, sensor: str, precisi
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
 def test_a_precision_that_sparse_weights_lack_takes_the_others(monkeypatch: pytest.MonkeyPatch, precision: str) -> None:
     """As in the wheel, which has them in int8 alone."""
-    int8 = [variant for variant in networks.resolve("pointseg-sparse") if variant.precision == "int8"]
-    monkeypatch.setattr(networks, "resolve", lambda _: int8)
+    int8 = [variant for variant in sessions.resolve("pointseg-sparse") if variant.precision == "int8"]
+    monkeypatch.setattr(sessions, "resolve", lambda _: int8)
     perceive = Perceiver("pointseg", sensor="vlp-16", precision=precision, provider="cpu")
     assert [*perceive.providers] == ["pointseg-sparse" if precision == "int8" else "pointseg"]
 

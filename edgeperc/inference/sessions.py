@@ -13,7 +13,7 @@ from .session import Session
 Model = str | os.PathLike[str]
 
 
-class Networks:
+class Sessions:
     """Sessions of models by name or path, each loaded when a sensor first needs it."""
 
     def __init__(self, models: Sequence[Model], precision: str, load: Callable[[Model], Session]) -> None:
