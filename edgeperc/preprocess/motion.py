@@ -93,6 +93,11 @@ class Motion:
                 f"got poses that are {second_s - first_s:g} s apart; expected at most {LONGEST_S:g} s: are the times "
                 "in another unit?"
             )
+        return cls._of(first, second, second_s - first_s)
+
+    @classmethod
+    def _of(cls, first: Floats, second: Floats, duration: float) -> Motion:
+        """`between` of rigid poses, however long it takes: whoever stands may write no pose for minutes."""
         R = first[:3, :3].T @ second[:3, :3]
         axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         sine = 0.5 * float(np.linalg.norm(axis))
@@ -106,7 +111,6 @@ class Motion:
         cross = np.cross(np.eye(3), turn)
         share = 1.0 / 12.0 if angle < 1e-4 else (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
         way = (np.eye(3) - 0.5 * cross + share * cross @ cross) @ first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
-        duration = second_s - first_s
         (x, y, z), (roll, pitch, yaw) = (way / duration).tolist(), (turn / duration).tolist()
         return cls((x, y, z), (roll, pitch, yaw))
 
@@ -251,7 +255,7 @@ class Trajectory:
         """
         before, after = self._around(first_s, last_s)
         poses, times_s = self.T_world_sensor, self.times_s
-        return Motion.between(poses[before], float(times_s[before]), poses[after], float(times_s[after]))
+        return Motion._of(poses[before], poses[after], float(times_s[after] - times_s[before]))
 
     def pose(self, at_s: float) -> Floats:
         """T_world_sensor (4, 4) at a time [s], between the poses around it, such as for a `Tracker` or a `RollingGrid`.

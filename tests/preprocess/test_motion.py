@@ -47,6 +47,14 @@ def test_points_are_moved_as_by_the_twin(n: int, velocity: Any, rate: Any, data:
     assert not np.isfinite(moved[~good, :3]).all(axis=1).any()
 
 
+def test_who_stands_may_write_no_pose_for_minutes() -> None:
+    """But a pose more than a minute after another one is no motion of a scan."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    assert Trajectory(np.array([0.0, 120.0]), poses).motion(50.0, 50.1) == Motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.raises(StampError, match="120 s apart"):
+        Motion.between(poses[0], 0.0, poses[1], 120.0)
+
+
 @given(RATES, RATES, st.floats(0.05, 0.4))
 def test_the_motion_between_two_poses(velocity: Any, rate: Any, seconds: float) -> None:
     start = twins.motion.exponential(twins.motion.screw((30.0, -7.0, 2.0), (0.3, -0.2, 1.4)))
