@@ -20,7 +20,7 @@ TRAINING_SENSOR = SENSORS["hdl-64e"]
 # How often one with random beams, a known one that spins and one without beams is drawn.
 SHARES = (0.35, 0.45, 0.2)
 SPARSE_SHARES = (0.15, 0.6, 0.25)
-SPARSE_GAP_DEG = 0.9  # median gap of the beams that is drawn for sparse sensors, at least; they have 1.5
+TRAINED_GAP_DEG = 0.9  # median gap of the beams that is drawn for sparse sensors, at least; they have 1.5
 KNOWN = tuple(
     sensor for name, sensor in {**SENSORS, **PUBLIC_SENSORS}.items() if name not in ("hdl-64e", "semantickitti", "vod")
 )
@@ -38,12 +38,12 @@ def drawn_sensor(rng: np.random.Generator, *, sparse: bool = False) -> SensorPro
     """
     kind = rng.choice(3, p=SPARSE_SHARES if sparse else SHARES)
     spinning, patterned = (
-        [each for each in of if not sparse or each.median_gap_deg >= SPARSE_GAP_DEG] for of in (SPINNING, PATTERNED)
+        [each for each in of if not sparse or each.median_gap_deg >= TRAINED_GAP_DEG] for of in (SPINNING, PATTERNED)
     )
     if kind == 0:
         up, down = rng.uniform(0.0, 20.0), rng.uniform(-30.0, -12.0)
         columns = int(rng.choice([900, 1024, 1800, 2048]))
-        least, most = (8, int((up - down) / SPARSE_GAP_DEG) + 1) if sparse else (12, 48)
+        least, most = (8, int((up - down) / TRAINED_GAP_DEG) + 1) if sparse else (12, 48)
         return SensorProfile.uniform("random", int(rng.integers(least, most + 1)), up, down, columns=columns)
     if kind == 1:
         if sparse:
@@ -65,8 +65,8 @@ def taken_by(
     Of a sensor without beams, points in its field of view remain at random, as densely as it has them.
     """
     source = scan.sensor or TRAINING_SENSOR
-    is_dense = source.pattern is None and source.median_gap_deg < SPARSE_GAP_DEG
-    if source is not TRAINING_SENSOR and not (of_any and is_dense):
+    is_dense = source.pattern is None and source.median_gap_deg < TRAINED_GAP_DEG
+    if scan.sensor is not None and not (of_any and is_dense):
         return scan
     points, own = scan.points, np.array(source.elevations_deg)
     slope = points[:, 2] / (np.hypot(points[:, 0], points[:, 1]) + np.abs(points[:, 2]) + 1e-6)
