@@ -51,6 +51,8 @@ class Scale(NamedTuple):
 # The first one holds the others. The last one is for people beside walls or each other: only their upper bodies are
 # apart.
 SCALES = (Scale(0.2, 2.6, 0.5, MAX_LENGTH_M), Scale(0.3, 2.2, 0.3, MAX_LENGTH_M), Scale(0.9, 2.2, 0.3, 2.5))
+# Links across wide gaps between beams join people with what is near: at a part of that distance they are apart.
+WIDE_PER_M, CLOSE = 0.03, 0.25
 
 
 class Cells(NamedTuple):
@@ -111,10 +113,10 @@ def find_candidates(scan: Scan, cells: Cells, distance_per_m: float = 0.015) -> 
     n_cells = len(cells.flat)
     around, sizes = np.full(n_cells, -1, np.int32), np.empty(n_cells, np.int32)
     found = []
-    for k, scale in enumerate(SCALES):
+    for k, per_m in links_of(distance_per_m):
+        scale = SCALES[k]
         group, order = np.empty((2, n_cells), np.int32)
         first = np.empty(n_cells + 1, np.int32)
-        per_m = distance_per_m * scale.link_m / SCALES[0].link_m
         n_groups = fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
         fits = np.empty((n_groups, 5))
         n = fit_groups(
@@ -125,6 +127,14 @@ def find_candidates(scan: Scan, cells: Cells, distance_per_m: float = 0.015) -> 
             around = group
             sizes = np.diff(first[: n_groups + 1])
     return Candidates(np.concatenate(found), cells)
+
+
+def links_of(distance_per_m: float) -> list[tuple[int, float]]:
+    """Numbers of the `SCALES`, and the distance for each meter of range at which cells are linked: the first holds all
+    others. The smaller scales are linked closely, too, where beams are far apart.
+    """
+    links = [(k, distance_per_m * scale.link_m / SCALES[0].link_m) for k, scale in enumerate(SCALES)]
+    return links + [(k, CLOSE * per_m) for k, per_m in links[1:] if distance_per_m > WIDE_PER_M]
 
 
 class Groups(NamedTuple):

@@ -95,10 +95,10 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
     np.testing.assert_array_equal(numbers[cells.flat], np.arange(len(right)))
     around: list[set[int]] = []
     n_found = 0
-    for k, scale in enumerate(candidates.SCALES):
+    for k, per_m in candidates.links_of(distance_per_m):
+        scale = candidates.SCALES[k]
         group, order = np.empty((2, len(right)), np.int32)
         first = np.empty(len(right) + 1, np.int32)
-        per_m = distance_per_m * scale.link_m / candidates.SCALES[0].link_m
         n = candidates.fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
         found = [{*cells.flat[order[first[g] : first[g + 1]]].tolist()} for g in range(n)]
         expected = twins.objects.groups(right, scan.ground.height_m, scale, per_m)
@@ -144,6 +144,18 @@ def test_what_is_too_long_too_low_or_too_small_is_no_candidate() -> None:
     assert n_found(candidates.MAX_LENGTH_M + 0.5, 1.5, 200) == 0
     assert n_found(4.0, 0.4, 80) == 0
     assert n_found(0.1, 1.5, 3) == 0
+
+
+def test_two_people_are_apart_where_beams_are() -> None:
+    """1.2 m from each other, 25 m ahead of a sensor whose points are linked at up to 1.7 m there."""
+    rng = np.random.default_rng(5)
+    height = np.tile(np.linspace(0.5, 1.7, 4, dtype=np.float32), 8)
+    points = np.zeros((32, 4), np.float32)
+    points[:, 0] = 25.0 + rng.uniform(-0.1, 0.1, 32)
+    points[:, 1] = np.repeat([0.0, 1.2], 16) + rng.uniform(-0.2, 0.2, 32)
+    scan = scan_of(points, height)
+    found = candidates.find_candidates(scan, candidates.sort_into_cells(scan, RANGE_M), 0.07).rectangles
+    assert {round(y / 1.2) for _, y, length, _, _ in found if length < 0.6} == {0, 1}
 
 
 def test_a_distance_is_in_radians() -> None:
