@@ -191,6 +191,9 @@ class Recipe:
         "share of the candidates that are boxes which the network itself finds, as at its second look",
         TASKS["objects"],
     )
+    thinned: bool = _option(
+        False, "real scans as sensors of few beams, or without beams, take them are trained on, too", TASKS["objects"]
+    )
     runs: int = _option(
         1,
         "runs, with one seed after the other; the mean of their weights is exported, which holds less of what chance "
@@ -465,7 +468,14 @@ MODELS = {
     # Without halls it took walls, beams and pipes for trucks; without yards, trucks across the way for walls.
     "objects-start": Stage(OBJECTS, also=OBJECT_SCANS),
     "objects-again-start": Stage(SECOND_LOOK, after="objects-start", also=OBJECT_SCANS),
-    "objects": Stage(replace(SECOND_LOOK, runs=2), after="objects-again-start", also=(*OBJECT_SCANS, "yards")),
+    "objects-yards-start": Stage(
+        replace(SECOND_LOOK, runs=2), after="objects-again-start", also=(*OBJECT_SCANS, "yards")
+    ),
+    "objects": Stage(
+        replace(SECOND_LOOK, steps=19_000, thinned=True),
+        after="objects-yards-start",
+        also=(*OBJECT_SCANS, "yards", "sparse"),
+    ),
     "ssadnet-open": _open(
         replace(OPEN, network="ssadnet", height_above_ground=False, front=True, n_pasted=3.0), also=("sensors",)
     ),

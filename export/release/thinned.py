@@ -1,8 +1,9 @@
-"""Real scans as sparser sensors would have taken them: accuracy of points on KITTI's drives kept back.
+"""Real scans as sparser sensors would have taken them: accuracy of points and boxes on KITTI's drives kept back.
 
 Run as ``python -m edgeperc_export.release.thinned KITTI [--sensors vlp-16] [--models pointseg:int8 pointseg]``. Of the
 HDL-64E's beams, those nearest to the sensor's remain, with its columns; its range, noise and remission stay, and none
-looks up by more than 2 degrees. Prints a table of Markdown: of the network alone, and of the whole answer.
+looks up by more than 2 degrees. Prints a table of Markdown: of the network alone, and of the whole answer, with
+its boxes.
 """
 
 from __future__ import annotations
@@ -14,10 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgeperc import Perceiver
 from edgeperc.datasets.kitti import Frame, KittiObjects
-from edgeperc.evaluation.metrics import Confusion
-from edgeperc.simulation.samples import IGNORE
+from edgeperc.evaluation.judge import BY_DEFAULT, NETWORK_ALONE, Judge
+from edgeperc.evaluation.tables import figures
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SensorProfile, get_sensor
@@ -40,18 +40,17 @@ def thinned(frame: Frame, sensor: SensorProfile) -> Frame:
 
 
 def row_of(kitti: KittiObjects, model: str, sensor: str, whole: bool) -> str:
-    """What runs, and IoU of cars, pedestrians and cyclists [%]."""
+    """What runs; IoU of the points of cars, pedestrians and cyclists; of the whole answer AP of cars, R40 [%]."""
     profile = profile_of(sensor)
-    models = ["ssadnet", model, "objects"] if whole else [model]
-    perceive = Perceiver(models, sensor=profile, on_mismatch="ignore", agree=whole)
-    counts = Confusion(POINT_CLASSES)
-    for name in (*kitti.names("validation"), *kitti.names("test")):
-        scan = LabeledScan.from_frame(thinned(kitti.frame(name), profile))
-        found = perceive(scan.points).require_points()
-        known = found.in_view & (scan.labels != IGNORE)
-        counts.update(found.labels[known], scan.labels[known])
-    (name,) = (card.name for card in perceive.cards if card.view.kind == "range_image")
-    return f"{name} | " + " / ".join(f"{100 * iou:.1f}" for iou in counts.iou()[1:])
+    models, how = (["ssadnet", model, "objects"], BY_DEFAULT) if whole else ([model], NETWORK_ALONE)
+    judge = Judge(models, how, sensor=profile)
+    frames = (kitti.frame(name) for name in (*kitti.names("validation"), *kitti.names("test")))
+    found = figures([judge.record(judge.kitti(thinned(frame, profile)))[0] for frame in frames], 0)
+    (name,) = (card.name for card in judge.perceive.cards if card.view.kind == "range_image")
+    points = " / ".join(f"{100 * found['points']['all'][label]['iou']:.1f}" for label in POINT_CLASSES[1:])
+    measures = ("bird's eye 0.5", "bird's eye 0.7", "3-D 0.7") if whole else ()
+    cars = [f"{100 * found['kitti']['car'][measure]['moderate']['ap_r40']:.1f}" for measure in measures]
+    return f"{name} | {points} | {' / '.join(cars) or '-'}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -62,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sensors", nargs="*", default=[*SENSORS], metavar="NAME")
     parser.add_argument("--models", nargs="*", default=["pointseg:int8", "pointseg"], metavar="MODEL")
     given = parser.parse_args(arguments)
-    print("| sensor | answer | network | IoU car / pedestrian / cyclist |")
-    print("|---|---|---|---|")
+    print("| sensor | answer | network | IoU car / pedestrian / cyclist | AP of cars: bird's eye 0.5 / 0.7 / 3-D 0.7 |")
+    print("|---|---|---|---|---|")
     for sensor in given.sensors:
         for whole in (False, True):
             for model in given.models:

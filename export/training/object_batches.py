@@ -20,12 +20,13 @@ from edgeperc.types.points import Floats, Floats32, Ints64, Mask, Points
 from ..cards import OBJECT_CLASSES
 from ..networks.objects import LEAST, ObjectNet, Parts, parts_of
 from .object_samples import BACKGROUND, DETECTED, GROUP, N_STORED, TRUE, ObjectSamples
-from .object_sets import PASTED, SIMULATED
+from .object_sets import SIMULATED, SPARSE, varied
 from .object_task import VEHICLE, Objects
 
 # Shares of the classes in a batch.
 SHARES = {BACKGROUND: 0.45, 1: 0.26, 2: 0.08, 3: 0.04, 4: 0.09, 5: 0.07, VEHICLE: 0.01}
-SIMULATED_WEIGHT, PASTED_WEIGHT = 0.02, 0.5  # of an object of simulation or pasted into scans, for one of KITTI
+# Of an object of simulation, pasted into scans of a set other than KITTI, or thinned as well, for one of KITTI.
+SIMULATED_WEIGHT, PASTED_WEIGHT, SPARSE_WEIGHT = 0.02, 0.5, 2.0
 SIMULATED_BACKGROUND = 0.3  # of walls, hedges and halls there are many kinds; real scans show those of few streets
 ALIKE = 0.5  # samples of one object count as this power of their number
 
@@ -134,7 +135,8 @@ def _of_source(name: str) -> float:
     """How often an object of a source counts, for one of KITTI."""
     if name == SIMULATED:
         return SIMULATED_WEIGHT
-    return PASTED_WEIGHT if name.endswith(f"-{PASTED}") and not name.startswith("kitti") else 1.0
+    weight = SPARSE_WEIGHT if name.endswith(f"-{SPARSE}") else 1.0
+    return weight if name.startswith("kitti") or varied(name) == name else PASTED_WEIGHT * weight
 
 
 def _weights(samples: ObjectSamples, names: Sequence[str]) -> Floats:

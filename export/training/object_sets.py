@@ -22,8 +22,8 @@ from .object_samples import DriveScan, build_samples, digest_of_files
 
 VALIDATION = "validation"
 SIMULATED = "simulated"
-PASTED = "pasted"
-"""Suffix of a source: the scans of another one with objects of its scans pasted in."""
+PASTED, SPARSE = "pasted", "sparse"
+"""Suffixes of a source: the scans of another one with objects of its scans pasted in; such as sparse sensors take."""
 BEAMS = 0.1  # share of the variants that another sensor takes
 N_VARIANTS = 4  # of each scan
 ODDS = {"car": 0.35, "van": 0.15, "truck": 0.05, "pedestrian": 0.25, "cyclist": 0.2}
@@ -38,10 +38,12 @@ def write_samples(
     n_workers: int = 0,
     *,
     detector: bool = True,
+    thinned: bool = False,
 ) -> dict[str, dict[str, str]]:
     """Write the samples of all scans, each fold of KITTI's training drives and its validation drives a source of its
     own; those in ``out`` of the same scans are kept. Returns the sources, with the hashes of the real scans of each.
-    Test drives are not read. Raises ValueError for sets that cannot be told apart by their names.
+    Test drives are not read. ``thinned``: also of scans as sparse sensors take them. Raises ValueError for sets that
+    cannot be told apart by their names.
     """
     _check_names(scan_sets)
     hashes: dict[str, dict[str, str]] = {}
@@ -49,9 +51,9 @@ def write_samples(
 
     def write(name: str, labeled: Sequence[DriveScan], own: dict[str, str]) -> None:
         made_of, hashes[name] = build(name, labeled, real=True), own
-        if name != VALIDATION:
-            build(f"{name}-{PASTED}", variants(labeled), real=True, made_of=made_of)
-            hashes[f"{name}-{PASTED}"] = {}
+        for kind in (PASTED, SPARSE)[: 1 + thinned] if name != VALIDATION else ():
+            build(f"{name}-{kind}", variants(labeled, sparse=kind == SPARSE), real=True, made_of=made_of)
+            hashes[f"{name}-{kind}"] = {}
 
     if kitti is not None:
         objects = KittiObjects(kitti)
@@ -84,7 +86,7 @@ def _check_names(scan_sets: Sequence[ScanFolder]) -> None:
     """Raise ValueError if a set has the name of another source, whose samples would be taken for its own."""
     of_sets = [folder.layout.name for folder in scan_sets]
     names = [VALIDATION, SIMULATED, *(f"kitti-{k}" for k in (*range(len(FOLDS)), "other")), *of_sets]
-    names += [f"{name}-{PASTED}" for name in names]
+    names += [f"{name}-{kind}" for name in names for kind in (PASTED, SPARSE)]
     if twice := next((folder for folder in scan_sets if names.count(folder.layout.name) > 1), None):
         raise ValueError(
             f"{twice.root}: another source of samples is called {twice.layout.name!r}, too; change the name in its "
@@ -92,10 +94,16 @@ def _check_names(scan_sets: Sequence[ScanFolder]) -> None:
         )
 
 
-def variants(scans: Sequence[DriveScan]) -> list[DriveScan]:
+def varied(source: str) -> str:
+    """The source whose scans another one varies, or itself."""
+    name, _, kind = source.rpartition("-")
+    return name if kind in (PASTED, SPARSE) else source
+
+
+def variants(scans: Sequence[DriveScan], *, sparse: bool = False) -> list[DriveScan]:
     """The scans of drives, with objects of these scans alone pasted in: leaving them out leaves those out."""
     bank = _Bank([scan for _, scan in scans])
-    return [(drive, partial(_pasted, scan, bank, k)) for drive, scan in scans for k in range(N_VARIANTS)]
+    return [(drive, partial(_pasted, scan, bank, sparse, k)) for drive, scan in scans for k in range(N_VARIANTS)]
 
 
 class _Bank:
@@ -112,9 +120,9 @@ class _Bank:
         return {"objects": self.objects}
 
 
-def _pasted(make: Callable[[], LabeledScan], bank: _Bank, seed: int) -> LabeledScan:
-    """A scan with objects of a bank among its own."""
+def _pasted(make: Callable[[], LabeledScan], bank: _Bank, sparse: bool, seed: int) -> LabeledScan:
+    """A scan with objects of a bank among its own, or that as a sparse sensor takes it."""
     scan = make()
     rng = np.random.default_rng((seed, len(scan.points)))
-    sensor = drawn_sensor(rng) if rng.random() < BEAMS else None
-    return augmented(scan, rng, PASTING, bank.objects, sensor)
+    sensor = drawn_sensor(rng, sparse=sparse) if sparse or rng.random() < BEAMS else None
+    return augmented(scan, rng, replace(PASTING, sparse=sparse), bank.objects, sensor)

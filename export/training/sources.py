@@ -32,7 +32,7 @@ from .camera import Camera
 from .images import ImageSamples, ImageWatch, camvid_samples
 from .object_batches import ObjectBatches, ObjectWatch
 from .object_samples import load_samples
-from .object_sets import PASTED, VALIDATION, write_samples
+from .object_sets import VALIDATION, varied, write_samples
 from .object_task import Objects
 from .samples import Samples, Watch, real_scans
 from .task import Task, task_of
@@ -108,9 +108,10 @@ def _object_source(recipe: Recipe, folder: Path, data: Data, n_workers: int) -> 
         folder = folder.with_name(f"{folder.name}-of-groups")
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):  # a run on other scans replaces the samples
-        hashes = write_samples(folder, data.kitti, data.simulated, data.scan_sets, n_workers, detector=recipe.detector)
+        how = {"detector": recipe.detector, "thinned": recipe.thinned}
+        hashes = write_samples(folder, data.kitti, data.simulated, data.scan_sets, n_workers, **how)
         watched = [VALIDATION if data.fold is None else f"kitti-{data.fold}"]
-        trained = [name for name in hashes if name != VALIDATION and name.removesuffix(f"-{PASTED}") not in watched]
+        trained = [name for name in hashes if name != VALIDATION and varied(name) not in watched]
         if not trained:
             raise ValueError("no scans to train objects on; give --kitti, --scans, --simulated or several of them")
         seen = {name: of for source in trained for name, of in hashes[source].items()}

@@ -354,7 +354,7 @@ def test_samples_are_of_the_scans_and_labels_that_are_there(labeled: LabeledScan
     assert samples(labeled) == first
 
 
-@pytest.mark.parametrize("name", ["validation", "simulated", "kitti-0", "kitti-0-pasted"])
+@pytest.mark.parametrize("name", ["validation", "simulated", "kitti-0", "kitti-0-pasted", "kitti-0-sparse"])
 def test_a_set_has_a_name_of_its_own(tmp_path: Path, name: str) -> None:
     (tmp_path / "velodyne").mkdir()
     (tmp_path / "label").mkdir()
@@ -402,6 +402,8 @@ def test_other_processes_paste_the_same_objects(labeled: LabeledScan, tmp_path: 
     labeled.save(tmp_path / "scan.npz")
     pasted = variants([("drive", partial(LabeledScan.load, tmp_path / "scan.npz"))])
     assert len({len(scan().points) for _, scan in pasted}) > 1
+    sparse = variants([("drive", partial(LabeledScan.load, tmp_path / "scan.npz"))], sparse=True)
+    assert all((sensor := scan().sensor) is not None and sensor.median_gap_deg > 0.8 for _, scan in sparse)
     for n_workers in (0, 1):
         build_samples(tmp_path / str(n_workers), "pasted", pasted, real=True, detector=False, n_workers=n_workers)
     ours, theirs = (load_samples(tmp_path / folder, ["pasted"]) for folder in ("0", "1"))
