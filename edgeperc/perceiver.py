@@ -29,10 +29,10 @@ from .pipeline import Options, Parts, Pipeline, RangeImageNetwork, TopViewNetwor
 from .preprocess import findings
 from .preprocess.condition import scale
 from .preprocess.fitness import FitnessProfile
-from .preprocess.health import Normal, check_health, findings_of, without_drops
+from .preprocess.health import Normal, check_health, findings_of, sample_step, without_drops
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
-from .preprocess.returns import about_too_near, returns
+from .preprocess.returns import about_too_near, own_returns, returns
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
@@ -644,7 +644,7 @@ class Perceiver:
                 if self._to_check == CHECKED_SCANS:  # no scan before it told the sensor
                     self._sensor_estimate = None
                 raise
-        scan, health, parts = self._without_drops(scan, upright, watch)
+        scan, health, parts = self._without_drops(scan, given, upright, watch)
         return Perception(
             n_points=len(scan),
             n_dropped=dropped.total,
@@ -664,15 +664,19 @@ class Perceiver:
         )
 
     def _without_drops(
-        self, scan: Points, profile: SensorProfile, watch: Stopwatch
+        self, scan: Points, given: Points, profile: SensorProfile, watch: Stopwatch
     ) -> tuple[Points, SensorHealth, Parts]:
-        """The scan without rain and snow, the sensor's health, and what is perceived.
+        """The scan without rain and snow, the sensor's health (by the scan as given), and what is perceived.
 
         Drops come in scan after scan. Where the last one had none, this one is perceived while it is checked (1.7 ms on
         one core), and anew if it has some.
         """
         assert self._pipeline is not None
-        check = partial(check_health, sensor=profile, normal=self._normal, eye_m=self._frame.eye)
+        own: Points | None = None
+        if profile.ego_box is not None:
+            sample = given[:: sample_step(len(given))]
+            own = self._frame.move(own_returns(sample, profile, self._estimator.known.origin_m))
+        check = partial(check_health, sensor=profile, normal=self._normal, eye_m=self._frame.eye, own=own)
         parts = None if self._has_drops else self._pipeline(scan, self._mounting, watch, check)
         health, self._normal = check(scan) if parts is None else parts.beside
         self._has_drops = health.has_drops

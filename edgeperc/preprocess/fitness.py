@@ -228,7 +228,8 @@ class Walls(NamedTuple):
     enclosed: float = 0.0
     # the same for the nearest three quarters of the points of each: the others may be seen through windows
     mostly_enclosed: float = 0.0
-    through_m: float = math.inf  # how far two opposite directions are seen [m], each by a tenth of its points
+    # how far two opposite directions are seen [m], each by a tenth of its points; one, where the other has no points
+    through_m: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -363,7 +364,10 @@ def _walls(points: Points) -> Walls:
         return float((used & (top - bottom >= _WALL_HEIGHT_M)).sum() / max(1, np.count_nonzero(used)))
 
     most = ends(0.9)
-    through_m = float(np.minimum(most, np.roll(most, N_SECTORS // 2)).max())
+    opposite = np.roll(most, N_SECTORS // 2)
+    both = np.minimum(most, opposite)
+    # The own body hides one of two. Of a part of a turn, none are both seen.
+    through_m = float(np.where(opposite > 0.0, both, most).max()) if both.any() else 0.0
     return Walls(enclosed(1.0, 1), enclosed(0.75, _FEWEST_OF_SECTOR), through_m)
 
 

@@ -75,14 +75,25 @@ class Normal:
         return Normal(fewest, (*self.ranges_m, range_m), (*self.returns, n_returns), reach_deg)
 
 
+def sample_step(n_points: int) -> int:
+    """Every how many points of a scan are looked at."""
+    return next((step for step in _STEPS if n_points <= step * _SAMPLE), n_points // _SAMPLE | 1)
+
+
 def check_health(
-    points: Points, sensor: SensorProfile, normal: Normal, eye_m: ArrayLike = (0.0, 0.0, 0.0)
+    points: Points,
+    sensor: SensorProfile,
+    normal: Normal,
+    eye_m: ArrayLike = (0.0, 0.0, 0.0),
+    own: Points | None = None,
 ) -> tuple[SensorHealth, Normal]:
     """Measure what window and weather do to a scan in the frame of the models, and compare it with the first scans;
     returns the health, and ``normal`` with this scan if that is not complete.
+
+    own : returns of the own vehicle, which ``points`` lack, of every `sample_step`-th row. They came through the window.
     """
     eye, points = np.array(eye_m, np.float64), read_only(points)
-    step = next((step for step in _STEPS if len(points) <= step * _SAMPLE), len(points) // _SAMPLE | 1)
+    step = sample_step(len(points))
     # Beams of a higher sensor meet the ground farther away at the same elevation.
     height_m = max(MODEL_HEIGHT_M + float(eye[2]), 0.1)
     beams = np.tan(np.radians(sensor.elevations_deg))
@@ -92,6 +103,12 @@ def check_health(
     n_sampled, n_low = fill_sectors(points, eye, step, tans, counts, ranges)
     if n_sampled == 0:
         return SensorHealth(), normal
+    n_expected = n_sampled * len(lowest) / len(beams)
+    if own is not None:
+        counts_own = np.empty_like(counts)
+        n_own, n_own_low = fill_sectors(read_only(own), eye, 1, tans, counts_own, np.empty_like(ranges))
+        counts, n_low = counts + counts_own, n_low + n_own_low
+        n_expected += n_own * len(lowest) / len(beams)
     wedge = _WEDGE * min(1.0, _USUAL_POINTS / len(points))  # of as many points
     near, has_remission = _isolated(points, eye, sensor, wedge, (0, 0), None)
     n_near = int(near[:, 0].sum())
@@ -101,7 +118,6 @@ def check_health(
     isolated = float(near[:, 1].sum()) / n_near if n_near >= _FEWEST_NEAR else 0.0
     known = bool(normal.ranges_m)
     has_drops, has_cloud = _has_drops(near, has_remission) if n_near >= _FEWEST_NEAR else (False, False)
-    n_expected = n_sampled * len(lowest) / len(beams)
     are_judged = lowest[0] < tans[1] and height_m >= MIN_MOUNT_HEIGHT_M and n_expected > _FEWEST_OF_LOWEST
     is_cut = are_judged and n_low <= _BLOCKED * n_expected
     share = n_sampled * step / median_high(normal.returns) if known else 1.0

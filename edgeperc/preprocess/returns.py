@@ -41,6 +41,14 @@ def blank_too_near(points: Points, min_range_m: float) -> Floats32:
     return _blanked(points, np.zeros(3), min_range_m, None)[0]
 
 
+def own_returns(points: Points, sensor: SensorProfile, origin_m: tuple[float, float]) -> Floats32:
+    """The rows of a scan (n, 4) from the vehicle that carries the sensor: inside the profile's ``ego_box``."""
+    assert sensor.ego_box is not None
+    about = points[:, :3] - np.array([*origin_m, 0.0])
+    lows, highs = np.array(sensor.ego_box).T
+    return points[((lows <= about) & (about <= highs)).all(axis=1)]
+
+
 def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile) -> str:
     """A sentence about the rows that are too near: how many, what they are, what was done, how to change it."""
     return (

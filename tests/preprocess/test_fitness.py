@@ -324,6 +324,13 @@ def test_ceilings_and_walls_are_not_taken_for_the_ground(
     assert any("a garage or a hall" in finding for finding in found) or not is_hall
 
 
+@pytest.mark.parametrize("width_m", [12.0, 16.0])
+def test_a_street_of_which_the_own_body_hides_one_end_is_no_hall(width_m: float) -> None:
+    x, y, *_ = (points := enclosed((200.0, width_m, 30.0), 1.2, "os1-64")).T
+    found = [leveled(each / np.float32([1, 1, 1, 65535]), "os1-64") for each in (points, points[x > -np.abs(y)])]
+    assert not any("hall" in finding for finding in [*found[0], *found[1]])
+
+
 @pytest.mark.parametrize("crop_m", [8.0, 12.0, 20.0])
 def test_a_street_that_is_cropped_is_no_room(crop_m: float) -> None:
     for seed in SEEDS:

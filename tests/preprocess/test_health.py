@@ -315,6 +315,21 @@ def test_a_perceiver_tells_of_each_kind_once_and_leaves_drops_out() -> None:
     assert grid.obstacle.sum() < worse.obstacle.sum()
 
 
+@pytest.mark.parametrize("sensor", ["hdl-64e", "vlp-16"])
+def test_what_the_own_body_hides_is_not_blocked_and_dirt_before_it_is(sensor: str) -> None:
+    scan = clear(11, sensor).copy()
+    behind = scan[:, 0] < -np.abs(scan[:, 1])
+    scan[behind, :3] /= -scan[behind, :1]  # meets a wall 1 m behind the sensor
+    box = ((-1.1, -0.9), (-1.1, 1.1), (-1.0, 1.0))
+    perceive = Perceiver("pointseg", sensor=replace(get_sensor(sensor), ego_box=box), on_mismatch="ignore")
+    found = perceive(scan)
+    assert found.dropped.ego == behind.sum()
+    assert (found.health.blocked_deg, found.health.beams_missing) == ((), 0)
+    for left, right in ((60.0, 20.0), (-160.0, 160.0)):
+        perceive.reset_mounting()
+        assert perceive(weather.dirty(scan, left, right)).health.blocked_deg == ((left, right),)
+
+
 def test_ignoring_mismatches_keeps_quiet_and_another_vehicle_is_learned_anew() -> None:
     perceive = Perceiver("pointseg", on_mismatch="ignore")
     found = perceive(weather.dirty(clear(11), 60.0, 10.0))
