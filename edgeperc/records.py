@@ -37,6 +37,7 @@ SCAN_KEYS = (
     "point_counts",
     "n_in_view",
     "tracks",
+    "tracks_late",
     "fitness",
     "mounting",
     "remission",
@@ -53,13 +54,15 @@ _NUMBER = re.compile(r"(?<![0-9])0*([0-9]{1,6})[^0-9]*$")  # of a frame; times h
 
 
 def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
-    """`Perception.to_dict` with the road ahead and the tracks, as ``edgeperc run --json`` prints it.
+    """`Perception.to_dict` with the road ahead and the tracks, as ``edgeperc run --json`` prints it. ``tracks_late``
+    says whether the scan came late or twice, and so has no tracks; None if it was not tracked.
 
     Returns: With the keys of `SCAN_KEYS`; None for results of a kind of model that was not used.
     """
     record = perception.to_dict()
     listed = [*(tracks or ())]
     record |= {"road": _road_record(perception), "tracks": [track.to_dict() for track in listed], "map_tracks": None}
+    record["tracks_late"] = None if tracks is None else tracks.is_late
     if perception.origin_m is not None:
         boxes = perception.in_map(track.box for track in listed)
         record["map_tracks"] = [{"id": track.id, **box.to_dict()} for track, box in zip(listed, boxes, strict=True)]

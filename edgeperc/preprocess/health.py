@@ -90,7 +90,7 @@ def check_health(
     """Measure what window and weather do to a scan in the frame of the models, and compare it with the first scans;
     returns the health, and ``normal`` with this scan if that is not complete.
 
-    own : returns of the own vehicle, which ``points`` lack, of every `sample_step`-th row. They came through the window.
+    own : the own vehicle's, which ``points`` lack, in every `sample_step`-th row: they came through the window.
     """
     eye, points = np.array(eye_m, np.float64), read_only(points)
     step = sample_step(len(points))

@@ -275,6 +275,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, shell: Shell
         "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},
         "n_in_view": 5,
         "tracks": [],
+        "tracks_late": None,
         "fitness": ["the scan has 32 beams"],
         "mounting": {"height_m": 1.73, "roll_deg": 0.0, "pitch_deg": 0.66, "yaw_deg": 0.0, "origin_m": [0.0, 0.0]},
         "remission": None,

@@ -151,10 +151,10 @@ def test_only_observed_road_is_in_the_json() -> None:
     assert nothing["road"]["outline"] == []
 
 
-def followed() -> Tracks:
-    """The track of a car that stands."""
+def followed(*again: int) -> Tracks:
+    """The track of a car that stands, and where the scans of some numbers come ``again``, after the last of them."""
     tracker = Tracker()
-    return [tracker.update([CAR], 0.1 * k, np.eye(4)) for k in range(5)][-1]
+    return [tracker.update([CAR], 0.1 * k, np.eye(4)) for k in (*range(5), *again)][-1]
 
 
 def test_a_record_adds_road_and_tracks() -> None:
@@ -166,6 +166,9 @@ def test_a_record_adds_road_and_tracks() -> None:
     assert len(record["road"]["holes"]) == 1  # the car is not in the outline
     (track,) = tracks
     assert record["tracks"] == [track.to_dict()]
+    with pytest.warns(UserWarning, match="a late or doubled scan has no tracks"):
+        late, unknown = scan_record(perception_of(CAR), followed(3)), scan_record(perception_of(CAR))
+    assert (late["tracks"], [each["tracks_late"] for each in (record, late, unknown)]) == ([], [False, True, None])
     assert Box.from_dict(track.to_dict()) == Box.from_dict(track.box.to_dict())
     without = scan_record(perception_of(labels=False))
     assert tuple(without) == SCAN_KEYS
