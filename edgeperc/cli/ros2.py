@@ -80,7 +80,7 @@ def add_parser(commands: Commands) -> None:
         "the pose of the ground in the grid's origin)",
     )
     memory = options(parser, "grid with memory")
-    memory("--odometry NAME", "topic of nav_msgs/Odometry, for the output rolling (default: none)")
+    memory("--odometry NAME", "topic of nav_msgs/Odometry, for the output rolling and the tracks (default: none)")
     memory(
         "--sensor-pose X Y Z ROLL PITCH YAW",
         "of the clouds' frame in the odometry's child frame, in meters and degrees (default: the same if the "

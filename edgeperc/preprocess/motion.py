@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -365,15 +365,15 @@ def deskew(
 
 
 def merge(
-    scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
+    scans: Iterable[ArrayLike], T_vehicle_sensor: Iterable[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
 ) -> Floats32:
     """Join the scans of several sensors to one scan in the frame of the vehicle.
 
     Parameters
     ----------
-    scans : sequence of (n, 4) or (n, 3) array_like, or structured arrays
+    scans : iterable of (n, 4) or (n, 3) array_like, or structured arrays
         Taken at the same time, each in the frame of its sensor. `deskew` moves scans to one time.
-    T_vehicle_sensor : sequence of (4, 4) array_like
+    T_vehicle_sensor : iterable of (4, 4) array_like
         Pose of each sensor: maps its points to the frame of the vehicle, whose z is 0 on the road.
     min_range_m : float or sequence of float
         Nearest range of the sensors, or of each [m]; as in `deskew`. In the merged scan, it can no longer be told.
@@ -393,17 +393,17 @@ def merge(
     OptionError
         ``min_range_m`` is not one number of meters from 0, or one for each scan.
     """
-    rows = [as_points(scan) for scan in scans]
+    rows, poses = [as_points(scan) for scan in scans], list(T_vehicle_sensor)
     if not rows:
         raise PointsError("got no scan; expected at least one")
-    if len(T_vehicle_sensor) != len(rows):
-        raise SensorError(f"got {len(T_vehicle_sensor)} poses for {len(rows)} scans; expected one for each")
-    ranges_m = [min_range_m] * len(rows) if not isinstance(min_range_m, Sequence) else list(min_range_m)
+    if len(poses) != len(rows):
+        raise SensorError(f"got {len(poses)} poses for {len(rows)} scans; expected one for each")
+    ranges_m = list(min_range_m) if isinstance(min_range_m, Sequence | np.ndarray) else [min_range_m] * len(rows)
     if len(ranges_m) != len(rows):
         raise OptionError(f"got {len(ranges_m)} values of min_range_m for {len(rows)} scans; expected one for each")
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
     begin = 0
-    for k, (scan, given, range_m) in enumerate(zip(rows, T_vehicle_sensor, ranges_m, strict=True)):
+    for k, (scan, given, range_m) in enumerate(zip(rows, poses, ranges_m, strict=True)):
         pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
         R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
         seen = blank_too_near(scan, _OPTIONS.number("min_range_m", range_m, 0.0))

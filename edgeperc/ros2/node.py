@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..tracking.tracker import Tracker
+    from ..tracking.tracks import Tracks
+    from ..types.mounting import Mounting
     from ..types.perception import Perception
-    from ..types.points import Floats32
+    from ..types.points import Floats, Floats32
 
 __all__ = ["PerceptionNode"]
 
@@ -68,6 +70,7 @@ class PerceptionNode:
     topic : str
         Of sensor_msgs/PointCloud2.
     tracker : Tracker, optional
+        With ``rolling``, it takes the poses of the odometry, and a cloud without one is answered without tracks.
     frame_id : str, optional
         Frame of the answers, by default that of each cloud.
     grid_frame_id : str, optional
@@ -131,6 +134,7 @@ class PerceptionNode:
         self._recent: deque[bytes] = deque(maxlen=_MOST_GATHERED)
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
+        self._pose: Floats | None = None  # of the last cloud in the frame of the odometry
         self._unplaced = ""
         self._rates = _Rates()
         self._error: Exception | None = None
@@ -144,7 +148,8 @@ class PerceptionNode:
         self._outputs: dict[str, Output] = {}
         self._diagnostics = graph.advertise("/diagnostics", messages.DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
-        self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
+        track = None if tracker is None else self._track
+        self._stream = stream(iter(self._waiting.get, None), self._perceive, track, rate_hz=rate_hz)
         self._state: State = "unconfigured"
         self._is_connected, self._changing = False, threading.Lock()
         try:
@@ -304,7 +309,37 @@ class PerceptionNode:
             points = np.concatenate([*earlier, points])
         perception = perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
         self._points, self._stamp_ns, self._cloud, self._sensor = points, stamp_ns, cloud, perceiver.sensor
+        if self._rolling is not None:
+            self._place(self._rolling, perception.mounting)
         return perception
+
+    def _place(self, rolling: Rolling, mounting: Mounting) -> None:
+        """Set the pose of the cloud; without one, count it."""
+        assert self._stamp_ns is not None
+        try:
+            pose = self._poses.at(self._stamp_ns)
+            if pose is None:
+                raise TrackingError("no pose at the time of the cloud")
+        except TrackingError as exc:
+            self._lose_pose(exc)
+            return
+        frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
+        self._pose = pose @ rolling.base_from_sensor(*frames, mounting)
+
+    def _lose_pose(self, reason: TrackingError) -> None:
+        self._pose, self._unplaced = None, str(reason)
+        self._n_unplaced += 1
+
+    def _track(self, perception: Perception) -> Tracks | None:
+        """The tracks; None with an odometry that has no pose of the cloud, without which they would begin anew."""
+        assert self._tracker is not None
+        if self._rolling is None:
+            return self._tracker(perception)
+        try:
+            return None if self._pose is None else self._tracker(perception, self._pose)
+        except TrackingError as exc:
+            self._lose_pose(exc)
+            return None
 
     def _earlier(self, newest: bytes, stamp_ns: int, gather_s: float) -> Iterator[Floats32]:
         """Points of the clouds that came in the time before the newest, dropped ones, too: `edgeperc.accumulate`."""
@@ -347,21 +382,13 @@ class PerceptionNode:
         return scan
 
     def _remember(self, scan: PerceivedScan) -> None:
-        """Take a scan into the rolling grid and publish it; without a pose, count it."""
-        if self._rolling is None:
+        """Take a scan with a pose into the rolling grid and publish it."""
+        if self._rolling is None or self._pose is None:
             return
-        assert self._stamp_ns is not None
         try:
-            pose = self._poses.at(self._stamp_ns)
-            if pose is None:
-                raise TrackingError("no pose at the time of the cloud")
-            frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
-            pose = pose @ self._rolling.base_from_sensor(*frames, scan.perception.mounting)
-            tracks = scan.tracked or ()
-            self._rolling.grid.update(scan.perception, scan.points, pose, tracks=tracks)
+            self._rolling.grid.update(scan.perception, scan.points, self._pose, tracks=scan.tracked or ())
         except TrackingError as exc:
-            self._n_unplaced += 1
-            self._unplaced = str(exc)
+            self._lose_pose(exc)
             return
         if self._outputs[messages.ROLLING].is_wanted:
             message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)
@@ -386,6 +413,8 @@ class PerceptionNode:
             level, message = {"OK": (0, "OK"), "LATE": (1, "LATE"), "STALE": (3, "STALE: no answer of late")}[health]
             if level == 0 and n_failed:
                 level, message = 1, f"{n_failed} clouds of the last second failed"
+            elif level == 0 and self._rolling is not None and self._pose is None:
+                level, message = 1, f"the odometry does not place the newest cloud: {self._unplaced}"
         values = {
             "topic": self._topic,
             "state": self._state,

@@ -103,7 +103,7 @@ def test_merged_scans_lie_in_the_vehicles_frame(rate: Any, n_sensors: int, seed:
         np.column_stack([(p - T[:3, 3]) @ T[:3, :3], np.full(len(p), k)])
         for k, (p, T) in enumerate(zip(vehicle, poses, strict=True))
     ]
-    merged = merge(scans, poses)
+    merged = merge(iter(scans), iter(poses), min_range_m=np.zeros(n_sensors))
     np.testing.assert_allclose(merged[:, :3], np.concatenate(vehicle), atol=1e-4)
     assert merged[:, 3].tolist() == [k for k, p in enumerate(vehicle) for _ in p]
 

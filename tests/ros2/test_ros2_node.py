@@ -405,21 +405,22 @@ def test_topics_have_names_of_ones_own() -> None:
     }
 
 
-def test_the_grid_with_memory_follows_the_odometry(quick: None) -> None:
+def test_the_grid_with_memory_and_the_tracks_follow_the_odometry(quick: None) -> None:
     """A sensor 1 m ahead of the vehicle's middle, turned to the left, on a vehicle that turns as it drives."""
     points, n = street(), 4
     rolling = Rolling(sensor_pose=(1.0, 0.0, 1.73, 0.0, 0.0, 90.0), grid=RollingGrid(size_m=60.0, cell_m=0.5))
-    with running(rolling=rolling) as (graph, _, outcomes):
+    with running(rolling=rolling, tracker=Tracker()) as (graph, _, outcomes):
         for k in range(n):
             stamp_ns = 10**9 + k * 10**8
             graph.odometry(odometry(stamp_ns - 5 * 10**7, 10.0 + k - 0.5, 20.0, 0.0))
             graph.odometry(odometry(stamp_ns + 5 * 10**7, 10.0 + k + 0.5, 20.0, 0.0))
             graph.give(cloud(points, stamp_ns))
-            assert isinstance(next(outcomes), PerceivedScan)
+            np.testing.assert_allclose(next(outcomes).tracks.T_world_sensor[:3, 3], [11.0 + k, 20.0, 1.73], atol=1e-6)
             graph.odometry(b"no odometry")
         graph.give(cloud(points, 10**10))
-        assert isinstance(next(outcomes), PerceivedScan)  # without a pose
-        until(lambda: any(v.value == "no pose at the time of the cloud" for v in last_status(graph).values))
+        assert next(outcomes).tracks is None  # without a pose
+        until(lambda: "does not place the newest cloud: no pose at the time" in last_status(graph).message)
+        assert "no pose at the time of the cloud" in [each.value for each in last_status(graph).values]
     grids = [MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/edgeperc/rolling"]]
     assert len(grids) == n
     assert {grid.header.frame_id for grid in grids} == {"odom"}
