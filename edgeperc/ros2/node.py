@@ -385,6 +385,7 @@ class PerceptionNode:
         """Take a scan with a pose into the rolling grid and publish it."""
         if self._rolling is None or self._pose is None:
             return
+        assert self._stamp_ns is not None
         try:
             self._rolling.grid.update(scan.perception, scan.points, self._pose, tracks=scan.tracked or ())
         except TrackingError as exc:
