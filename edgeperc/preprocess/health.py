@@ -103,12 +103,11 @@ def check_health(
     n_sampled, n_low = fill_sectors(points, eye, step, tans, counts, ranges)
     if n_sampled == 0:
         return SensorHealth(), normal
-    n_expected = n_sampled * len(lowest) / len(beams)
-    if own is not None:
+    n_returns = n_sampled
+    if own is not None:  # a load hides what returned before
         counts_own = np.empty_like(counts)
         n_own, n_own_low = fill_sectors(read_only(own), eye, 1, tans, counts_own, np.empty_like(ranges))
-        counts, n_low = counts + counts_own, n_low + n_own_low
-        n_expected += n_own * len(lowest) / len(beams)
+        counts, n_returns, n_low = counts + counts_own, n_sampled + n_own, n_low + n_own_low
     wedge = _WEDGE * min(1.0, _USUAL_POINTS / len(points))  # of as many points
     near, has_remission = _isolated(points, eye, sensor, wedge, (0, 0), None)
     n_near = int(near[:, 0].sum())
@@ -118,9 +117,10 @@ def check_health(
     isolated = float(near[:, 1].sum()) / n_near if n_near >= _FEWEST_NEAR else 0.0
     known = bool(normal.ranges_m)
     has_drops, has_cloud = _has_drops(near, has_remission) if n_near >= _FEWEST_NEAR else (False, False)
+    n_expected = n_returns * len(lowest) / len(beams)
     are_judged = lowest[0] < tans[1] and height_m >= MIN_MOUNT_HEIGHT_M and n_expected > _FEWEST_OF_LOWEST
     is_cut = are_judged and n_low <= _BLOCKED * n_expected
-    share = n_sampled * step / median_high(normal.returns) if known else 1.0
+    share = n_returns * step / median_high(normal.returns) if known else 1.0
     is_other = not 1.0 / _OTHER_RETURNS < share < _OTHER_RETURNS
     steep = _steepness(points[::step], eye) if is_cut or is_other or not normal.is_complete else np.empty(0)
     is_hazy = n_near >= _FEWEST_NEAR and _everywhere(near, near[:, 1]) > _HAZE
@@ -141,7 +141,7 @@ def check_health(
         has_fog=known and is_dimmed and range_m < _SHRUNK * median_high(normal.ranges_m),
     )
     health = replace(health, findings=tuple(text for _, text in findings_of(health)))
-    return health, normal.add(counts, range_m, float(n_sampled * step), steep)
+    return health, normal.add(counts, range_m, float(n_returns * step), steep)
 
 
 def without_drops(points: Points, sensor: SensorProfile, eye_m: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Floats32, int]:

@@ -322,6 +322,9 @@ def test_what_the_own_body_hides_is_not_blocked_and_dirt_before_it_is(sensor: st
     scan[behind, :3] /= -scan[behind, :1]  # meets a wall 1 m behind the sensor
     box = ((-1.1, -0.9), (-1.1, 1.1), (-1.0, 1.0))
     perceive = Perceiver("pointseg", sensor=replace(get_sensor(sensor), ego_box=box), on_mismatch="ignore")
+    perceive(clear(11, sensor))
+    assert perceive(scan).health.returns_share == pytest.approx(1.0, abs=0.01)
+    perceive.reset_mounting()
     found = perceive(scan)
     assert found.dropped.ego == behind.sum()
     assert (found.health.blocked_deg, found.health.beams_missing) == ((), 0)
