@@ -316,30 +316,23 @@ class PerceptionNode:
     def _place(self, rolling: Rolling, mounting: Mounting) -> None:
         """Set the pose of the cloud; without one, count it."""
         assert self._stamp_ns is not None
-        try:
-            pose = self._poses.at(self._stamp_ns)
-            if pose is None:
-                raise TrackingError("no pose at the time of the cloud")
-        except TrackingError as exc:
-            self._lose_pose(exc)
-            return
-        frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
-        self._pose = pose @ rolling.base_from_sensor(*frames, mounting)
+        pose = self._poses.at(self._stamp_ns)
+        if pose is None:
+            self._lose_pose("no pose at the time of the cloud")
+        else:
+            frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
+            self._pose = pose @ rolling.base_from_sensor(*frames, mounting)
 
-    def _lose_pose(self, reason: TrackingError) -> None:
-        self._pose, self._unplaced = None, str(reason)
+    def _lose_pose(self, reason: str) -> None:
+        self._pose, self._unplaced = None, reason
         self._n_unplaced += 1
 
     def _track(self, perception: Perception) -> Tracks | None:
         """The tracks; None with an odometry that has no pose of the cloud, without which they would begin anew."""
         assert self._tracker is not None
-        if self._rolling is None:
-            return self._tracker(perception)
-        try:
-            return None if self._pose is None else self._tracker(perception, self._pose)
-        except TrackingError as exc:
-            self._lose_pose(exc)
+        if self._rolling is not None and self._pose is None:
             return None
+        return self._tracker(perception, self._pose)
 
     def _earlier(self, newest: bytes, stamp_ns: int, gather_s: float) -> Iterator[Floats32]:
         """Points of the clouds that came in the time before the newest, dropped ones, too: `edgeperc.accumulate`."""
@@ -389,7 +382,7 @@ class PerceptionNode:
         try:
             self._rolling.grid.update(scan.perception, scan.points, self._pose, tracks=scan.tracked or ())
         except TrackingError as exc:
-            self._lose_pose(exc)
+            self._lose_pose(str(exc))
             return
         if self._outputs[messages.ROLLING].is_wanted:
             message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)

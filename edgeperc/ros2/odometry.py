@@ -17,7 +17,6 @@ from ..road.rolling import RollingGrid
 from ..types.frame import pose_between
 from ..types.mounting import Mounting
 from ..types.points import Floats
-from ..types.rigid import rigid
 from .graph import full_name
 from .messages import RosMessages
 
@@ -25,6 +24,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TOLERANCE_S = 0.2
 """A cloud may be newer than the newest pose by this; then the newest one is taken."""
 _MOST = 1000  # poses that are kept; 5 s at 200 Hz
+_FARTHEST_M = 9e7  # the sensor, which is beside, is within what trackers and grids take
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +96,13 @@ class Poses:
                 return None
             (ns, place, turn), (later_ns, later_place, later_turn) = (*self._poses[k - 1 : k + 1], self._poses[-1])[:2]
         share = (stamp_ns - ns) / (later_ns - ns) if later_ns > ns else 0.0
-        pose = pose_between((place, turn), (later_place, later_turn), share)
-        return rigid("the odometry's pose", pose, TrackingError)
+        return pose_between((place, turn), (later_place, later_turn), share)
 
 
 def _parts(pose: Any) -> tuple[Floats, Floats]:
     """Position (3,) and unit quaternion x, y, z, w of a geometry_msgs/Pose. Raises TrackingError."""
     place = np.array([pose.position.x, pose.position.y, pose.position.z])
     turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
-    if not (np.isfinite(place).all() and abs(np.linalg.norm(turn) - 1.0) < 1e-2):
-        raise TrackingError(f"got the place {place} and the quaternion {turn}; expected finite numbers of length 1")
+    if not ((np.abs(place) < _FARTHEST_M).all() and abs(np.linalg.norm(turn) - 1.0) < 1e-2):
+        raise TrackingError(f"got the place {place}, the quaternion {turn}; expected up to {_FARTHEST_M:g} m, length 1")
     return place, np.asarray(turn / np.linalg.norm(turn), np.float64)
