@@ -286,12 +286,9 @@ def _beyond(steep: Floats, sensor: SensorProfile, normal: Normal) -> tuple[float
 
 def _arcs(marks: Mask) -> tuple[tuple[float, float], ...]:
     """Left and right edge of each run of sectors [deg], -180..180, left positive."""
-    if not marks.any():
-        return ()
-    width = 360.0 / N_SECTORS
 
     def degrees(edge: int) -> float:
-        return (edge * width + 180.0) % 360.0 - 180.0
+        return (edge * (360.0 / N_SECTORS) + 180.0) % 360.0 - 180.0
 
     return tuple((degrees(first + n), degrees(first)) for first, n in _runs(marks))
 

@@ -280,7 +280,6 @@ class PerceptionNode:
                 self._tracker.reset()
             if self._rolling is not None:
                 self._rolling.grid.reset()
-        self._points, self._stamp_ns, self._cloud = None, None, None
         if len(data) > MAX_SCAN_BYTES:
             raise PointsError(f"the cloud has {len(data):,} bytes; expected at most {MAX_SCAN_BYTES:,}")
         cloud = self._messages.decode(data, messages.CLOUD)
@@ -318,14 +317,12 @@ class PerceptionNode:
         assert self._stamp_ns is not None
         pose = self._poses.at(self._stamp_ns)
         if pose is None:
-            self._lose_pose("no pose at the time of the cloud")
+            self._unplaced = "no pose at the time of the cloud"
         else:
             frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
-            self._pose = pose @ rolling.base_from_sensor(*frames, mounting)
-
-    def _lose_pose(self, reason: str) -> None:
-        self._pose, self._unplaced = None, reason
-        self._n_unplaced += 1
+            pose = pose @ rolling.base_from_sensor(*frames, mounting)
+        self._pose = pose
+        self._n_unplaced += pose is None
 
     def _track(self, perception: Perception) -> Tracks | None:
         """The tracks; None with an odometry that has no pose of the cloud, without which they would begin anew."""
@@ -382,7 +379,7 @@ class PerceptionNode:
         try:
             self._rolling.grid.update(scan.perception, scan.points, self._pose, tracks=scan.tracked or ())
         except TrackingError as exc:
-            self._lose_pose(str(exc))
+            self._pose, self._unplaced, self._n_unplaced = None, str(exc), self._n_unplaced + 1
             return
         if self._outputs[messages.ROLLING].is_wanted:
             message = self._messages.rolling(self._rolling.grid, self._poses.frame_id, self._stamp_ns)

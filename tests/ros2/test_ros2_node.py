@@ -264,9 +264,7 @@ def test_stamps_that_repeat_or_jump_are_answered_and_tracked_anew() -> None:
     poison_ns = (2**31 - 1) * 10**9 + 4 * 10**9
     stamps_ns = [s * 10**9 for s in (100, 101, 101, 50, 51)] + [poison_ns, 52 * 10**9, -(10**9), 53 * 10**9]
     graph, answers = answered((cloud(POINTS, stamp_ns) for stamp_ns in stamps_ns), tracker=Tracker())
-    sessions = []
-    for answer in answers:
-        sessions.append((answer.tracks.session, answer.tracks.is_late))
+    sessions = [(answer.tracks.session, answer.tracks.is_late) for answer in answers]
     assert sessions == [(0, False), (0, False), (0, True), *[(n, False) for n in (1, 1, 2, 1, 3, 1)]]
     for raw, stamp_ns in zip(graph.published["/edgeperc/points"], stamps_ns, strict=True):
         stamp = MESSAGES.decode(raw, CLOUD).header.stamp
