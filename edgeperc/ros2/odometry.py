@@ -8,11 +8,10 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 
-from ..errors import OptionError, PointsError, TrackingError
+from ..errors import OptionError, PointsError
 from ..road.rolling import RollingGrid
 from ..types.frame import pose_between
 from ..types.mounting import Mounting
@@ -76,15 +75,21 @@ class Poses:
         """Take the bytes of a message; what is no pose is counted."""
         try:
             message = self._messages.decode(data, ODOMETRY)
-            place, turn = _parts(message.pose.pose)
-        except (PointsError, TrackingError):
+        except PointsError:
+            self.n_failed += 1
+            return
+        pose = message.pose.pose
+        place = np.array([pose.position.x, pose.position.y, pose.position.z])
+        turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
+        length = float(np.linalg.norm(turn))
+        if not ((np.abs(place) < _FARTHEST_M).all() and abs(length - 1.0) < 1e-2):
             self.n_failed += 1
             return
         ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         with self._lock:
             # Later ones are of before a recording began again. A pose that came twice is taken once.
             del self._poses[bisect.bisect_left(self._poses, ns, key=itemgetter(0)) :]
-            self._poses.append((ns, place, turn))
+            self._poses.append((ns, place, turn / length))
             del self._poses[:-_MOST]
             self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
 
@@ -97,12 +102,3 @@ class Poses:
             (ns, place, turn), (later_ns, later_place, later_turn) = (*self._poses[k - 1 : k + 1], self._poses[-1])[:2]
         share = (stamp_ns - ns) / (later_ns - ns) if later_ns > ns else 0.0
         return pose_between((place, turn), (later_place, later_turn), share)
-
-
-def _parts(pose: Any) -> tuple[Floats, Floats]:
-    """Position (3,) and unit quaternion x, y, z, w of a geometry_msgs/Pose. Raises TrackingError."""
-    place = np.array([pose.position.x, pose.position.y, pose.position.z])
-    turn = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
-    if not ((np.abs(place) < _FARTHEST_M).all() and abs(np.linalg.norm(turn) - 1.0) < 1e-2):
-        raise TrackingError(f"got the place {place}, the quaternion {turn}; expected up to {_FARTHEST_M:g} m, length 1")
-    return place, np.asarray(turn / np.linalg.norm(turn), np.float64)
