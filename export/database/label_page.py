@@ -1,8 +1,8 @@
 """A local web page to draw roads over a database's images (section 3.3).
 
 Only this computer can open the page, and the page loads nothing from the network. Each change is saved to the COCO
-file. A model's draft counts as drawn only after it is confirmed: until then its polygons are in the file's ``drafts``,
-and no road of the scene is in the annotations. Pages of other sites, which a browser on this computer may have open,
+file, where roads stay that another program writes meanwhile. A model's draft counts as drawn only after it is
+confirmed: until then its polygons are in the file's ``drafts``, and no road of the scene is in the annotations. Pages of other sites, which a browser on this computer may have open,
 can neither read nor write: a request must name this server as its host, and a write also needs the page's origin and
 its token. No site can show the page in a frame. Requests are limited in size, number and time.
 """
@@ -70,9 +70,11 @@ class LabelServer(ThreadingHTTPServer):
         self.names = {*self.database.names}
         self.polygons, self.kitti = polygons, kitti
         self.lock = threading.Lock()
-        self.roads, self.drafts = _polygons(polygons) if polygons.exists() else ({}, {})
+        self.roads, self.drafts = dict[str, list[Any]](), dict[str, list[Any]]()
         self.scans = {row["scene"]: row["scan_sha256"] for row in self.database.rows}
-        self.scans |= scans_of(polygons, self.scans) if polygons.exists() else {}
+        self.content = b""  # of the file, as it was last read or written
+        self.read()
+        self.changed = set[str]()  # scenes that another program has changed since the page asked for them
         self.token = secrets.token_urlsafe(32)
         self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(("127.0.0.1", port), _Handler)
@@ -82,17 +84,39 @@ class LabelServer(ThreadingHTTPServer):
             f"{name}{end}" for name in ("127.0.0.1", "localhost") for end in (f":{taken}", "")[: 1 + (taken == 80)]
         }
 
+    def read(self) -> set[str]:
+        """Read the file if another program has written it; returns the scenes with other polygons than before."""
+        content = self.polygons.read_bytes() if self.polygons.is_file() else self.content
+        if content == self.content:
+            return set()
+        roads, drafts = _polygons(self.polygons)
+        self.scans |= scans_of(self.polygons, self.scans)
+        before, self.roads, self.drafts, self.content = (self.roads, self.drafts), roads, drafts, content
+        pairs = [*zip(before, (roads, drafts), strict=True)]
+        return {name for old, new in pairs for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
+
+    def polygons_of(self, name: str) -> list[Any]:
+        """A scene's polygons, drawn or a draft, as the file has them now."""
+        with self.lock:
+            self.changed = (self.changed | self.read()) - {name}
+            return self.roads.get(name) or self.drafts.get(name, [])
+
     def save(self, name: str, polygons: list[Any], *, confirmed: bool) -> None:
         """Set a scene's polygons, drawn or a draft, and write the file."""
         with self.lock:
+            self.changed |= self.read()
+            if name in self.changed:
+                text = f"another program has changed this scene in {self.polygons}; reload the page to see it"
+                raise _RefusedError(HTTPStatus.CONFLICT, text)
             roads, drafts = ({k: v for k, v in known.items() if k != name} for known in (self.roads, self.drafts))
             if polygons:
                 (roads if confirmed else drafts)[name] = polygons
             content = json.loads(write_coco(roads, self.scans))
             if drafts:
                 content["drafts"] = drafts
-            write_atomic(self.polygons, (json.dumps(content, indent=1) + "\n").encode())
-            self.roads, self.drafts = roads, drafts
+            written = (json.dumps(content, indent=1) + "\n").encode()
+            write_atomic(self.polygons, written)
+            self.roads, self.drafts, self.content = roads, drafts, written
 
     def state(self, name: str) -> str:
         """``"drawn"``, ``"draft"``, or ``""`` for a scene without polygons."""
@@ -248,7 +272,7 @@ class _Handler(BaseHTTPRequestHandler):
             if what == "draft":
                 return self._send_json(draft(server.database.scene(name).map))
             if what == "road":
-                return self._send_json(server.roads.get(name) or server.drafts.get(name, []))
+                return self._send_json(server.polygons_of(name))
         raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such thing here")
 
     def _put(self, what: str, name: str) -> None:

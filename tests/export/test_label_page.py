@@ -143,6 +143,20 @@ def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
         assert again.token != server.token
 
 
+def test_what_another_program_saves_meanwhile_stays(server: LabelServer, out: Path) -> None:
+    ask(server, "road/000003", ROAD)
+    with running(LabelServer(out, server.polygons)) as other:
+        for name in ("000001", "000003"):
+            assert ask(other, f"road/{name}", json.dumps([TRAPEZIUM, TRAPEZIUM])).status == 200
+    assert ask(server, "road/000002", ROAD).status == 200
+    assert [*read_coco([server.polygons])] == ["000001", "000002", "000003"]
+    for _ in range(2):  # the page shows what it was before
+        answer = ask(server, "road/000003", ROAD)
+        assert (answer.status, b"another program has changed this scene in " in answer.body) == (409, True)
+    assert roads(server, "000003") == [TRAPEZIUM, TRAPEZIUM]
+    assert ask(server, "road/000003", ROAD).status == 200
+
+
 def test_a_draft_counts_as_drawn_only_after_it_is_confirmed(server: LabelServer, out: Path) -> None:
     for name in ("000002", "000003"):
         assert ask(server, f"draft/{name}", ROAD).json == 1
