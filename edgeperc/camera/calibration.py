@@ -54,16 +54,7 @@ class Calibration:
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise CalibrationError(f"K has shape {K.shape}; expected a finite (3, 3) matrix, got {self.K!r:.200}")
         T = rigid("T_camera_sensor", self.T_camera_sensor, CalibrationError)
-        if max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - [0.0, 0.0, 1.0])) > ROW_TOLERANCE:
-            raise CalibrationError(
-                f"K is {K.tolist()}; expected [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], without skew. "
-                "Rectify the images first"
-            )
-        if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(K).max() <= 1e6):
-            raise CalibrationError(
-                f"K has focal lengths {K[0, 0]:g}, {K[1, 1]:g} and center {K[0, 2]:g}, {K[1, 2]:g}; expected focal "
-                "lengths above 0 and values up to 1e6 pixels"
-            )
+        _check_matrix("K", K)
         if np.abs(T[:3, 3]).max() > MAX_DISTANCE_M:
             raise CalibrationError(
                 f"T_camera_sensor has translation {T[:3, 3].tolist()}; expected at most {MAX_DISTANCE_M:g} m between "
@@ -112,10 +103,7 @@ class Calibration:
         K = P2[:, :3]
         # P2 moves from the rectified frame of camera 0 to camera 2, and projects: K (p + t).
         T_camera_rectified = np.eye(4)
-        try:
-            T_camera_rectified[:3, 3] = np.linalg.solve(K, P2[:, 3])
-        except np.linalg.LinAlgError as exc:
-            raise CalibrationError(f"{path}: P2 is {P2.tolist()}; expected K and a fourth column") from exc
+        T_camera_rectified[:3, 3] = np.linalg.solve(K, P2[:, 3])
         return cls(K, T_camera_rectified @ T_rectified_sensor, width, height)
 
     def resized(self, width: int, height: int) -> Calibration:
@@ -163,6 +151,12 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats
     path : a text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam), or of odometry P2 and Tr, which
         includes the rectification; of raw data the folder of a day, or either of its two files.
     """
+    T_rectified_sensor, P2 = _kitti_matrices(path)
+    _check_matrix(f"{path}: P2", P2)
+    return rigid(f"{path}: the place of the sensor", T_rectified_sensor, CalibrationError), P2
+
+
+def _kitti_matrices(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
     folder = Path(path) if Path(path).is_dir() else Path(path).parent
     is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
     values: dict[str, Floats] = {}
@@ -208,6 +202,26 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats
 
 _RAW_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")  # of a day's drives
 _NO_NUMBERS = ("calib_time",)
+
+
+def _check_matrix(name: str, K: Floats) -> None:
+    """Raise `CalibrationError` unless the first three columns are of a pinhole camera that is not mirrored."""
+    if max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2, :3] - [0.0, 0.0, 1.0])) > ROW_TOLERANCE:
+        raise CalibrationError(
+            f"{name} is {K.tolist()}; expected [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], without skew. "
+            "Rectify the images first"
+        )
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(K[:, :3]).max() <= 1e6):
+        raise CalibrationError(
+            f"{name} has focal lengths {K[0, 0]:g}, {K[1, 1]:g} and center {K[0, 2]:g}, {K[1, 2]:g}; expected focal "
+            "lengths above 0 and values up to 1e6 pixels"
+        )
+
+
+def level_heading(R_camera_sensor: Floats, yaw: ArrayLike) -> Floats:
+    """Direction (3, ...) of headings in the camera's frame, level there, as those of KITTI's labels are."""
+    (down_x, down_y, down_z), cos, sin = R_camera_sensor[1], np.cos(yaw), np.sin(yaw)
+    return R_camera_sensor @ np.stack([cos, sin, -(down_x * cos + down_y * sin) / down_z])
 
 
 def warn_off_center(K: Floats, width: int, height: int, advice: str) -> None:

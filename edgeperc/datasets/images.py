@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,9 @@ class LabeledImages:
             for file in sorted(folder.glob("[!.]*"))
             if file.suffix.lower() in IMAGE_SUFFIXES
         ]
+        for file, other in pairwise(files):  # they are sorted
+            if file.with_suffix("") == other.with_suffix(""):
+                raise ImageError(f"{file} and {other} would share the labels {file.stem}.png; remove or rename one")
         if not files:
             raise ImageError(f"{self.root} has no images of split {split}; expected some in {folders[0]}")
         return files

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera.calibration import read_kitti_calibration
+from ..camera.calibration import level_heading, read_kitti_calibration
 from ..errors import PointsError
 from ..readers.files import read_points
 from ..simulation.samples import IGNORE
@@ -76,9 +76,7 @@ class KittiCalibration:
         """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `sensor_boxes`."""
         R, t = self.T_cam_velo[:3, :3], self.T_cam_velo[:3, 3]
         right, down, ahead = R @ rows[:, :3].T + t[:, None]
-        cos, sin = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-        climb = -(R[1, 0] * cos + R[1, 1] * sin) / R[1, 2]  # of the heading that is level in the camera's frame
-        heading = R @ np.stack([cos, sin, climb])
+        heading = level_heading(R, rows[:, 6])
         return np.column_stack([ahead, -right, -down, rows[:, 3:6], np.arctan2(-heading[0], heading[2])])
 
     def image_rectangles(self, rows: Floats, image_size: tuple[int, int] = IMAGE_SIZE) -> Floats:

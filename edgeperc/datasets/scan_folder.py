@@ -112,7 +112,9 @@ class ScanFrame:
             low, high = self.layout.labeled_deg
             return math.radians(low), math.radians(high)
         focal, middle = self.calibration.P2[0, 0], self.calibration.P2[0, 2]
-        return -math.atan2((self.layout.image_size or kitti.IMAGE_SIZE)[0] - middle, focal), math.atan2(middle, focal)
+        x, y, _ = self.calibration.T_cam_velo[2, :3]  # the optical axis
+        width, looks = (self.layout.image_size or kitti.IMAGE_SIZE)[0], math.atan2(y, x)
+        return looks - math.atan2(width - middle, focal), looks + math.atan2(middle, focal)
 
     def known_at(self, places: NDArray[Any]) -> Mask:
         """Whether all objects at places (n, 3+) [m] have boxes, (n,) bool."""

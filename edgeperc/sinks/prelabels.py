@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..camera.calibration import read_kitti_calibration, warn_off_center
+from ..camera.calibration import level_heading, read_kitti_calibration, warn_off_center
 from ..errors import CalibrationError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
@@ -262,7 +262,7 @@ def _kitti_line(box: Box, T_cam_sensor: Floats, P2: Floats, size: tuple[int, int
     R, t = T_cam_sensor[:3, :3], T_cam_sensor[:3, 3]
     length, width, height = box.size
     center = R @ np.array(box.center) + t
-    ahead = R @ np.array([math.cos(box.yaw), math.sin(box.yaw), 0.0])
+    ahead = level_heading(R, box.yaw)
     turn = math.atan2(-ahead[2], ahead[0])
     x, y, z = center[0], center[1] + height / 2.0, center[2]  # the middle of the bottom face; y points down
     around = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))

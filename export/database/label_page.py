@@ -2,9 +2,10 @@
 
 Only this computer can open the page, and the page loads nothing from the network. Each change is saved to the COCO
 file, where roads stay that another program writes meanwhile. A model's draft counts as drawn only after it is
-confirmed: until then its polygons are in the file's ``drafts``, and no road of the scene is in the annotations. Pages of other sites, which a browser on this computer may have open,
-can neither read nor write: a request must name this server as its host, and a write also needs the page's origin and
-its token. No site can show the page in a frame. Requests are limited in size, number and time.
+confirmed: until then its polygons are in the file's ``drafts``, and no road of the scene is in the annotations. Pages
+of other sites, which a browser on this computer may have open, can neither read nor write: a request must name this
+server as its host, and a write also needs the page's origin and its token. No site can show the page in a frame.
+Requests are limited in size, number and time.
 """
 
 from __future__ import annotations

@@ -613,7 +613,7 @@ def write_int8(
     quantized = {
         "from": f"{card.name} {card.version}",
         "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
-        "calibration": f"{len(hashes)} images of CamVid" if card.view.kind == "camera" else kinds,
+        "calibration": f"{len(hashes)} images" if card.view.kind == "camera" else kinds,
         **made,
     }
     frames = {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})}

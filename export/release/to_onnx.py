@@ -76,6 +76,8 @@ TERMS = {
 CAMVID_LICENCE = (
     "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
 )
+CAMVID_SEQUENCES = ("0001TP_", "0006R0_", "0016E5_", "Seq05VD_")
+"""With one of these, the names of its images begin."""
 
 
 class ParityError(EdgepercError):
@@ -102,7 +104,11 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
     licence = terms_of(frames) or notes["licence"]
     if recipe.task == "camera":
-        data, licence = f"{len(frames)} images of CamVid", CAMVID_LICENCE
+        n_camvid = sum(name.startswith(CAMVID_SEQUENCES) for name in frames)
+        n_others, others = len(frames) - n_camvid, "images of another set"
+        of_set = ((n_camvid, "images of CamVid", CAMVID_LICENCE), (n_others, others, f"{others}: terms of that set"))
+        data = ", ".join(f"{n} {images}" for n, images, _ in of_set if n)
+        licence = "; ".join(terms for n, _, terms in of_set if n)
     return {
         "data": data,
         "frames": frames,

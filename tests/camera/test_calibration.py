@@ -200,13 +200,14 @@ def test_an_odometry_calibration_without_the_velodyne(tmp_path: Path) -> None:
     "text",
     ["", "nonsense", KITTI.replace("P2", "P9"), KITTI.replace("44.86 ", ""), KITTI.replace("721.5", "many"),
      KITTI.replace("R0_rect", "R9"), KITTI.replace("721.5", "0"), "\xff\xfe", KITTI.replace("721.5", "nan"),
-     KITTI.replace("44.86", "inf"), KITTI + "R_rect: -1e999 0 0\n"],
+     KITTI.replace("44.86", "inf"), KITTI + "R_rect: -1e999 0 0\n", KITTI.replace("velo_to_cam: ", "velo_to_cam: -"),
+     KITTI.replace("P2: ", "P2: -")],
 )  # fmt: skip
 def test_a_damaged_file_of_kitti_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "000000.txt"
     path.write_text(text, "latin-1")
     with pytest.raises(CalibrationError):
-        Calibration.from_kitti(path, 1242, 375)
+        read_kitti_calibration(path)
     with pytest.raises(OSError, match="missing"):
         Calibration.from_kitti(tmp_path / "missing.txt", 1242, 375)
 

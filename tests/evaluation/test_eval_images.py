@@ -114,6 +114,9 @@ def test_splits(tmp_path: Path, model: Path) -> None:
     assert evaluate_images([root], model)["split"] == "validation"
     write_set(root, {"test/d": right})
     assert evaluate_images([root], model)["split"] == "test"
+    pillow.fromarray(right).save(root / "test/d.png")
+    with pytest.raises(ImageError, match=r"d\.png and .*d\.webp would share the labels d\.png"):
+        data.files("test")
 
 
 def test_a_model_is_not_evaluated_on_what_it_was_trained_on(tmp_path: Path) -> None:

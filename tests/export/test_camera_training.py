@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from itertools import pairwise
@@ -62,8 +63,9 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
             labels[40:55, 10 + 5 * k : 30 + 5 * k] = 8
             labels[0, 0] = 11
             image = 20 * labels[..., None] + np.array([0, 10, 20]) + rng.integers(0, 12, (72, 96, 3))
-            Image.fromarray(image.astype(np.uint8)).save(root / folder / f"{k:03}.png")
-            Image.fromarray(labels).save(root / f"{folder}annot" / f"{k:03}.png")
+            name = f"{'0001TP_' if k > 1 else ''}{k:03}.png"
+            Image.fromarray(image.astype(np.uint8)).save(root / folder / name)
+            Image.fromarray(labels).save(root / f"{folder}annot" / name)
     names = dict(enumerate((*CAMERA_CLASSES, "Unlabeled")))
     (root / "classes.json").write_text(json.dumps(names))
     return root
@@ -211,7 +213,7 @@ def test_images_that_teach_nothing_or_are_watched_too_are_refused(drawn: Path, t
         shutil.copytree(drawn, tmp_path / name)
     for path in (tmp_path / "void/trainannot").iterdir():
         Image.fromarray(np.full((72, 96), 11, np.uint8)).save(path)
-    shutil.copy(tmp_path / "twice/train/002.png", tmp_path / "twice/val/001.png")
+    shutil.copy(tmp_path / "twice/train/001.png", tmp_path / "twice/val/001.png")
     for name, said in (("void", "nothing can be learned"), ("twice", "image 001 is the training image 002")):
         with pytest.raises(ValueError, match=said):
             train(replace(Recipe("camseg"), **SMALL), tmp_path / "run", camvid=tmp_path / name)
@@ -452,8 +454,8 @@ def test_card_of_camseg_names_camvid(trained: tuple[Path, Path], drawn: Path) ->
     card = ModelCard.read(trained[1])
     assert (card.view.kind, card.view.width, card.view.height) == ("camera", 64, 48)
     assert card.classes == CAMERA_CLASSES
-    assert "CamVid" in card.training["licence"]
-    assert card.training["data"] == "6 images of CamVid"
+    assert re.match("terms of CamVid: .*; images of another set: terms of that set", card.training["licence"])
+    assert card.training["data"] == "4 images of CamVid, 2 images of another set"
     figures = evaluate_images([drawn], trained[1], split="validation")
     assert figures["images"]["n_images"] == 3
     (drawn / "test").symlink_to(drawn / "train")
@@ -489,7 +491,7 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     out, given = tmp_path / "int8.onnx", (Calibration(images, hashes), LabeledSets(camvid=drawn))
     card = quantize(trained[1], out, *given, race=race, max_noise=9.0)
     assert card.precision == "int8"
-    assert card.training["quantized"]["calibration"] == "6 images of CamVid"
+    assert card.training["quantized"]["calibration"] == "6 images"
     assert card.metrics["images"]["n_images"] == 3
     # The record that "auto" decides by, with OpenVINO in bf16 too if it is installed and the processor has bf16.
     records = agree([trained[1], out], kitti=None, camvid=drawn)

@@ -301,6 +301,21 @@ def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
         written(tmp_path / "wrong", "kitti", perceived("a.bin"), calib=calib)
 
 
+def test_boxes_come_back_from_a_camera_that_looks_aside_and_down(tmp_path: Path) -> None:
+    aside, down = math.radians(50.0), math.radians(20.0)
+    cos, sin = math.cos(aside), math.sin(aside)
+    level = np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
+    turn = [[1.0, 0.0, 0.0], [0.0, math.cos(down), -math.sin(down)], [0.0, math.sin(down), math.cos(down)]]
+    place = " ".join(map(str, np.column_stack([turn @ level, [0.1, -0.2, 0.3]]).ravel()))
+    (calib := tmp_path / "calib.txt").write_text(
+        f"P2: 700 0 620.5 0 0 700 187 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {place}\n"
+    )
+    folder = written(tmp_path / "out", "kitti", perceived("a.bin", BOXES[:2]), calib=calib)
+    frame = training_folder(folder, "kitti", "a").frame("a")
+    check_rows(rows_of(frame.boxes), rows_of(BOXES[:2]))
+    assert sum(frame.azimuths) / 2.0 == pytest.approx(aside, abs=2e-3)
+
+
 def test_boxes_of_kitti_are_cut_to_the_image_that_was_perceived(tmp_path: Path) -> None:
     calib = tmp_path / "calib.txt"
     calib.write_text(CALIBRATION.replace("604.0814", "960").replace("180.5066", "600"))
