@@ -63,7 +63,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
             labels[40:55, 10 + 5 * k : 30 + 5 * k] = 8
             labels[0, 0] = 11
             image = 20 * labels[..., None] + np.array([0, 10, 20]) + rng.integers(0, 12, (72, 96, 3))
-            name = f"{'0001TP_' if k > 1 else ''}{k:03}.png"
+            name = f"{'0001TP_' if k < 2 else ''}{k:03}.png"
             Image.fromarray(image.astype(np.uint8)).save(root / folder / name)
             Image.fromarray(labels).save(root / f"{folder}annot" / name)
     names = dict(enumerate((*CAMERA_CLASSES, "Unlabeled")))
@@ -213,8 +213,8 @@ def test_images_that_teach_nothing_or_are_watched_too_are_refused(drawn: Path, t
         shutil.copytree(drawn, tmp_path / name)
     for path in (tmp_path / "void/trainannot").iterdir():
         Image.fromarray(np.full((72, 96), 11, np.uint8)).save(path)
-    shutil.copy(tmp_path / "twice/train/001.png", tmp_path / "twice/val/001.png")
-    for name, said in (("void", "nothing can be learned"), ("twice", "image 001 is the training image 002")):
+    shutil.copy(tmp_path / "twice/train/002.png", tmp_path / "twice/val/002.png")
+    for name, said in (("void", "nothing can be learned"), ("twice", "image 002 is the training image 002")):
         with pytest.raises(ValueError, match=said):
             train(replace(Recipe("camseg"), **SMALL), tmp_path / "run", camvid=tmp_path / name)
 
@@ -455,7 +455,7 @@ def test_card_of_camseg_names_camvid(trained: tuple[Path, Path], drawn: Path) ->
     assert (card.view.kind, card.view.width, card.view.height) == ("camera", 64, 48)
     assert card.classes == CAMERA_CLASSES
     assert re.match("terms of CamVid: .*; images of another set: terms of that set", card.training["licence"])
-    assert card.training["data"] == "4 images of CamVid, 2 images of another set"
+    assert card.training["data"] == "2 images of CamVid, 4 images of another set"
     figures = evaluate_images([drawn], trained[1], split="validation")
     assert figures["images"]["n_images"] == 3
     (drawn / "test").symlink_to(drawn / "train")
