@@ -103,14 +103,14 @@ def evaluate(
     check_different(datasets)
     for root in filter(_is_kitti, map(Path, datasets)):
         if not any(root.glob("frames*.csv")):
-            warnings.warn(
-                f"{root} has no frames.csv, so each scan counts as a drive: intervals are too narrow, and none is held "
-                "back. docs/concepts/measure.md shows how to write it",
-                stacklevel=2,
-            )
+            _tell_no_drives(root, "none is held back. docs/concepts/measure.md shows how to write it")
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     folders = job.folders()
+    for folder in folders.values():
+        if folder.layout.drives == "table" and not folder.has_table and len(folder.drives) > 1:
+            advice = "write it, or give drives in the description: one, or scan if these are no neighbors"
+            _tell_no_drives(folder.root, f"scans of one drive may be in two splits; {advice}")
     perceive, scans = job.scans(folders)
     for folder in folders.values():
         check_unit(folder, folder.layout.sensor, _names(folder, split, fold))
@@ -133,6 +133,11 @@ def evaluate(
         result["folders"] = {block.removeprefix(OF_FOLDER): of_block for block, of_block in blocks.items()}
     in_order = ("real", *(block for block in worst if block.startswith(OF_FOLDER)), "simulated")
     return result, next((worst[block] for block in in_order if block in worst), [])
+
+
+def _tell_no_drives(root: Path, more: str) -> None:
+    text = f"{root} has no frames.csv, so each scan counts as a drive: intervals are too narrow, and {more}"
+    warnings.warn(text, stacklevel=3)
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from edgeperc.cli.evaluation.box_tables import box_table_lines
 from edgeperc.datasets.kitti import KittiCalibration, KittiLabels
 from edgeperc.evaluation import kitti_ap
 from edgeperc.evaluation.metrics import Listed
+from edgeperc.evaluation.tables import _kitti_rows
 from edgeperc.types.perception import Box
 from twins import kitti_ap as twin
 
@@ -224,3 +226,10 @@ def test_thresholds_of_the_recall_positions_are_those_of_the_kit(n_truth: int, s
     rng = np.random.default_rng(seed)
     hits: NDArray[np.float64] = np.sort(rng.random(rng.integers(0, n_truth + 1)))[::-1]
     assert [hits[k] for k in recall_positions(len(hits), n_truth)] == twin.get_thresholds(hits.tolist(), n_truth)
+
+
+def test_a_missing_table_says_why() -> None:
+    """Pre-labels have the occlusion 3, unknown."""
+    unknown = labels(("car", label_row(box("car", 20.0, 0.0), occlusion=3)))
+    lines = box_table_lines({"kitti": _kitti_rows(table_of((unknown, [])))})
+    assert lines == ["", "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"]

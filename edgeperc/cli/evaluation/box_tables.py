@@ -36,6 +36,8 @@ def box_table_lines(figures: Mapping[str, Any]) -> list[str]:
                     marks = FEW * row.get("few", False) + CAPPED * (row["n_truth"] <= 40)
                     rows.append(((label, f"{overlap} {level}{marks}"), row))
     lines = table_lines("boxes as KITTI's benchmark measures them: AP at the IoU that is named", _KITTI_COLUMNS, rows)
+    if "kitti" in figures and not rows:
+        lines = ["", "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"]
     centers = figures.get("centers", {})
     rows = [
         ((f"{label}{FEW * row.get('few', False)}", ""), {**row, **_plain_errors(row)})

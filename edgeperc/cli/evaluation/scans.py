@@ -227,7 +227,7 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     for name, of_block in (*blocks, *figures.get("folders", {}).items()):
         if of_block is not None:
             lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
-            title = "labeled objects; each distinct object counts once, however often it is seen"
+            title = "labeled objects; boxes of one drive, class and size, to the centimeter, are one object"
             rows = [((_marked(label, row), ""), row) for label, row in of_block.get("labeled", {}).items()]
             lines += table_lines(title, _LABELED_COLUMNS, rows)
             for part in (_point_lines, box_lines, box_table_lines, error_lines, _cell_lines, _road_lines):
