@@ -222,11 +222,6 @@ class ScanFolder:
             raise PointsError(f"no layout {layout!r}; expected {', '.join(known_layouts())}, or a .json file")
         return cls(str(text))
 
-    @property
-    def has_table(self) -> bool:
-        """Whether a table, or the folders of SemanticKITTI, say the drives of the scans."""
-        return self.layout.files == "semantickitti" or (self.root / "frames.csv").exists()
-
     def names(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the labeled scans of a split (`ScanLayout.in_split`), drive by drive."""
         of_split = [name for name, drive in self.drives.items() if self.layout.in_split(drive, split, fold)]
@@ -312,7 +307,7 @@ class ScanFolder:
         if self.layout.drives == "one":
             return dict.fromkeys(labeled, self.layout.name)
         table = self.root / "frames.csv"
-        if self.layout.drives == "scan" or not self.has_table:
+        if self.layout.drives == "scan" or not table.exists():
             return {name: name for name in labeled}
         drives = {row["name"]: row["drive"] for row in kitti.read_drives(table)}
         if missing := [name for name in labeled if name not in drives]:

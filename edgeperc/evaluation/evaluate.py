@@ -108,7 +108,8 @@ def evaluate(
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     folders = job.folders()
     for folder in folders.values():
-        if folder.layout.drives == "table" and not folder.has_table and len(folder.drives) > 1:
+        by_table = (folder.layout.drives, folder.layout.files) == ("table", "plain")
+        if by_table and not (folder.root / "frames.csv").exists() and len(folder.drives) > 1:
             advice = "write it, or give drives in the description: one, or scan if these are no neighbors"
             _tell_no_drives(folder.root, f"scans of one drive may be in two splits; {advice}")
     perceive, scans = job.scans(folders)
