@@ -280,7 +280,7 @@ def _scans(judge: Judge, dataset: str | Path, folder: ScanFolder | None, split: 
 
     def record(name: str) -> _Figures:
         frame = scans.frame(name)
-        return judge.record_scan(frame) if truth_of is None else judge.record(truth_of(frame))
+        return judge.compare(*judge.perceive_frame(frame)) if truth_of is None else judge.record(truth_of(frame))
 
     drives = {} if folder is None else folder.drives
     return [(block, drives.get(name), partial(record, name)) for name in _names(scans, split, fold)]

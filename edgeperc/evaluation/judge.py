@@ -78,7 +78,7 @@ NETWORK_ALONE = Perceiving(boxes_from="network", rules=())
 
 class Judge:
     """Compares perceptions with their truth. ``road_by`` draws the road that KITTI's labels lack (SSADNet 3.1.2);
-    ``mounted``: scans as of a sensor mounted so, found from each alone; ``sensor``: of `record_scan`.
+    ``mounted``: scans as of a sensor mounted so, found from each alone; ``sensor``: of `perceive_frame`.
     """
 
     def __init__(
@@ -156,13 +156,8 @@ class Judge:
         """Evaluate one scan; there are no mistakes of scans whose objects are not labeled."""
         return self.compare(truth, self._perceive(truth.points))
 
-    def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
-        """Evaluate a scan of a `ScanFolder` as a user's: its mounting is that of its drive. Raises SplitError."""
-        truth, perception, scan_boxes = self.perceive_frame(frame)
-        return self.compare(truth, perception, scan_boxes)
-
     def record_boxes(self, frame: ScanFrame) -> Record:
-        """As `record_scan`, of the boxes alone: `kitti_ap` and `center_ap`."""
+        """Evaluate the boxes of a scan alone: `kitti_ap` and `center_ap`."""
         truth, perception, scan_boxes = self.perceive_frame(frame)
         tallies: dict[tuple[str, ...], Any] = {}
         if frame.boxes is not None:
@@ -170,7 +165,9 @@ class Judge:
         return Record(truth.name, truth.drive, tallies)
 
     def perceive_frame(self, frame: ScanFrame) -> tuple[Truth, Perception, Sequence[Box]]:
-        """Truth and perception of a scan in the frame of the models, and its boxes in that of the scan."""
+        """Truth and perception of a scan in the frame of the models, and its boxes in that of the scan; as a user's,
+        its mounting is that of its drive. Raises SplitError.
+        """
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if frame.drive != self.drive:
             self.perceive.reset_mounting()

@@ -15,7 +15,7 @@ from edgeperc.cli.evaluation.box_tables import box_table_lines
 from edgeperc.datasets.kitti import KittiCalibration, KittiLabels
 from edgeperc.evaluation import kitti_ap
 from edgeperc.evaluation.metrics import Listed
-from edgeperc.evaluation.tables import _kitti_rows
+from edgeperc.evaluation.tables import Record, figures
 from edgeperc.types.perception import Box
 from twins import kitti_ap as twin
 
@@ -231,5 +231,6 @@ def test_thresholds_of_the_recall_positions_are_those_of_the_kit(n_truth: int, s
 def test_a_missing_table_says_why() -> None:
     """Pre-labels have the occlusion 3, unknown."""
     unknown = labels(("car", label_row(box("car", 20.0, 0.0), occlusion=3)))
-    lines = box_table_lines({"kitti": _kitti_rows(table_of((unknown, [])))})
-    assert lines == ["", "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"]
+    record = Record("a", "drive", {("kitti",): table_of((unknown, []))})
+    (line,) = filter(None, box_table_lines(figures([record])))
+    assert line == "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"
