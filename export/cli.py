@@ -272,7 +272,7 @@ def _add_export(command: Command) -> None:
     _add_shared(add, "--model-version MODEL_VERSION")
     add(
         "--licence LICENCE",
-        "license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
+        "license of weights trained on simulation alone (default Apache-2.0); others have the terms of their sets",
         default="Apache-2.0",
     )
 
