@@ -9,6 +9,7 @@ import csv
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -133,15 +134,18 @@ class Frame:
     calibration: KittiCalibration
     labels: KittiLabels | None = None  # what ``boxes`` and ``unlabeled`` come from, if known
 
+    @cached_property
+    def known(self) -> Mask:
+        """Which points have known labels, (n,) bool: those in the camera's field of view and outside DontCare."""
+        return self.known_at(self.points)
+
     def known_at(self, points: NDArray[Any]) -> Mask:
-        """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool: in the camera's field of view
-        and outside DontCare.
-        """
+        """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool."""
         return self.calibration.labeled_at(points, self.unlabeled)
 
     def point_labels(self) -> Bytes:
         """True class of each point, (n,) uint8: the class of the box around it, `IGNORE` where the truth is unknown."""
-        labels = np.where(self.known_at(self.points), 0, IGNORE).astype(np.uint8)
+        labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
         for box in self.boxes:
             labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
         return labels
