@@ -38,6 +38,7 @@ from ..system.machine import (
     compiled_folder,
     cpu_features,
     fingerprint,
+    keep_compiled,
     read_setting,
     settings_path,
     usable_cores,
@@ -259,6 +260,7 @@ class Session:
         refuse = property(lambda _: False, lambda *_: None)
         network = type("Network", (ort.InferenceSession,), {"_enable_fallback": refuse})
         settings: dict[str, str] = {}
+        compiled = None
         try:
             if plugin:
                 if short == "openvino":
@@ -294,6 +296,8 @@ class Session:
         active = session.get_providers()
         if active[0] != PROVIDERS[short]:
             raise ProviderError(f"{self.path}: asked for {PROVIDERS[short]}, onnxruntime made {active} active")
+        if compiled is not None:
+            keep_compiled(compiled)
         return session
 
     def _check_graph(self) -> None:

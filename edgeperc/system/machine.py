@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 SCHEMA = 2
 MAX_BYTES = 1 << 24  # of a settings file; an entry has about 200
 MAX_THREADS = 4096
+DIGEST = "sha256"  # the file with the `_digest_of` a compiled model
 CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
@@ -89,12 +90,38 @@ def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
         make_folder(folder)
         reason = unusable_because(folder)
         if reason is None and os.access(folder, os.W_OK):
+            _remove_damaged(folder)
             return folder
         message = f"{folder}: {reason or 'it cannot be written'}"
     except (OSError, SettingsError) as exc:
         message = str(exc)
     logger.warning("the compiled model is not kept, and every start compiles it again: %s", message)
     return None
+
+
+def _remove_damaged(folder: Path) -> None:
+    """Remove files that are not as `keep_compiled` saw them: OpenVINO would compute with damaged weights."""
+    kept = read_text(folder / DIGEST)
+    if kept != _digest_of(folder):
+        for file in folder.iterdir():
+            file.unlink(missing_ok=True)
+        if kept is not None:
+            logger.warning("the compiled model in %s is damaged, and is compiled again", folder)
+
+
+def keep_compiled(folder: Path) -> None:
+    """Note what an engine has written to a `compiled_folder`, which the next start compares."""
+    try:
+        if (digest := _digest_of(folder)) != read_text(folder / DIGEST):
+            write_atomic(folder / DIGEST, digest.encode())
+    except OSError as exc:
+        logger.warning("the compiled model is not kept, and the next start compiles it again: %s", exc)
+
+
+def _digest_of(folder: Path) -> str:
+    """SHA-256 of the files of a compiled model."""
+    contents = [file.read_bytes() for file in sorted(folder.iterdir()) if DIGEST not in file.name]
+    return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in contents)).hexdigest()
 
 
 def cpu_model() -> str:

@@ -253,7 +253,7 @@ def test_auto_skips_a_provider_that_cannot_run_the_model(
         Session(model_path("pointseg"), "mirage")
 
 
-def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
+def test_the_openvino_plugin_agrees_with_the_cpu_provider(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     if "openvino" not in available_providers():
         pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
     for variant in listed():
@@ -261,6 +261,13 @@ def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
         # on the CPU provider.
         limit = 0.001 if variant.precision == "fp32" else 0.1
         assert Session(str(variant), "openvino", precision=variant.precision).golden_deviation < limit
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    made = []
+    for _ in range(2):
+        Session("lodnn:int8", "openvino")
+        made.append([(file, file.stat().st_mtime_ns) for file in tmp_path.rglob("*") if file.is_file()])
+    assert len(made[0]) == 2  # the compiled model and its digest
+    assert made[1] == made[0]
 
 
 class FakePlugins:

@@ -266,6 +266,29 @@ def test_compiled_folder_depends_on_engine_model_and_precision(monkeypatch: pyte
     assert machine.compiled_folder(*asked[0]) not in folders
 
 
+def test_a_compiled_model_that_is_damaged_is_compiled_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """OpenVINO loads it, and its labels are others: after a power failure, blocks of a new file may be zeros."""
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    asked = "a", "f" * 64, "fp32"
+    folder = machine.compiled_folder(*asked)
+    assert folder is not None
+    blob = folder / "1.blob"
+    blob.write_bytes(bytes(range(200)))
+    assert machine.compiled_folder(*asked) == folder
+    assert not blob.exists()  # a process ended before it was noted
+    blob.write_bytes(bytes(range(200)))
+    machine.keep_compiled(folder)
+    assert machine.compiled_folder(*asked) == folder
+    assert blob.exists()
+    assert not caplog.messages
+    blob.write_bytes(bytes(200))
+    assert machine.compiled_folder(*asked) == folder
+    assert not [*folder.iterdir()]
+    assert "is damaged, and is compiled again" in caplog.text
+
+
 def test_read_only_cache_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
