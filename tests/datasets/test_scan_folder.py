@@ -809,6 +809,8 @@ def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, shell: Sh
     assert figures[datasets[0]]["both"]["iou"]["car"] > 0.5
     for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
         assert "SENSOR=simulation:N" in shell.err("eval-sensors", source)
+    kept = folder_of(tmp_path / "kept", {**DESCRIPTION, "splits": {"train": ["*"]}}, label__a_dot_txt=LINES)
+    assert "has no scans of test drives" in shell.err("eval-sensors", kept)
 
 
 def test_public_sets(data_root: Callable[[str], Path]) -> None:
