@@ -6,8 +6,8 @@ which the tracker estimates.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -20,30 +20,15 @@ WINDOW = 5  # frames before and after, over which an object's speed is measured
 FRAME_S = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """Counts of boxes of tracks that match a label, without ignored ones."""
-
-    n_boxes: int = 0
-    n_tracks: int = 0
-    n_resolved: int = 0  # with a front (`edgeperc.Box.front`); the others' heading is known up to half a turn
-    n_right: int = 0  # of these, less than a quarter turn from the label's heading
-    n_right_of_all: int = 0  # of all boxes
-
-    def __add__(self, other: Standing) -> Standing:
-        return Standing(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
-
-
-@dataclass(frozen=True, slots=True)
-class Headings:
-    """Counts of objects that move (`MOVING_MPS`), that stand after they moved, and that never moved so far."""
-
-    moving: Standing = Standing()
-    stopped: Standing = Standing()
-    parked: Standing = Standing()
-
-    def __add__(self, other: Headings) -> Headings:
-        return Headings(self.moving + other.moving, self.stopped + other.stopped, self.parked + other.parked)
+# Of an object: faster than `MOVING_MPS`; standing after it moved; that never moved so far.
+MOTIONS = ("moving", "stopped", "parked")
+COUNTS = (
+    "n_boxes",  # of tracks that match a label, without ignored ones
+    "n_tracks",
+    "n_resolved",  # with a front (`edgeperc.Box.front`); the others' heading is known up to half a turn
+    "n_right",  # of these, less than a quarter turn from the label's heading
+    "n_right_of_all",
+)
 
 
 def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats]:
@@ -66,10 +51,11 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats
 
 def count_headings(
     truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
-) -> Headings:
-    """Count right headings in one sequence, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
-    rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
+) -> dict[str, Counter[str]]:
+    """`COUNTS` of one sequence by `MOTIONS`, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
+    counted = {motion: Counter(dict.fromkeys(COUNTS, 0)) for motion in MOTIONS}
     moved: set[int] = set()
+    met: set[tuple[str, int]] = set()
     for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
         mine = np.flatnonzero([label in labels for label in result.labels])
         iou = box_iou(frame.boxes, result.boxes[mine])
@@ -79,13 +65,11 @@ def count_headings(
             if iou[i].max(initial=0.0) < iou_threshold:
                 continue
             track = mine[int(iou[i].argmax())]
-            right = bool(np.cos(result.boxes[track, 6] - frame.boxes[i, 6]) > 0.0)
-            kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
-            rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
-    counted = []
-    for number in range(3):
-        of_kind = [row[1:] for row in rows if row[0] == number]
-        n_tracks, n_resolved = len({track for track, *_ in of_kind}), sum(resolved for _, resolved, _ in of_kind)
-        n_right = sum(resolved and right for _, resolved, right in of_kind)
-        counted.append(Standing(len(of_kind), n_tracks, n_resolved, n_right, sum(right for *_, right in of_kind)))
-    return Headings(*counted)
+            right = int(np.cos(result.boxes[track, 6] - frame.boxes[i, 6]) > 0.0)
+            resolved = int(result.fronts[track] >= 0.5)
+            motion = "moving" if moves[i] else "stopped" if int(frame.ids[i]) in moved else "parked"
+            met.add((motion, int(result.ids[track])))
+            counted[motion].update(n_boxes=1, n_resolved=resolved, n_right=resolved * right, n_right_of_all=right)
+    for motion, _ in met:
+        counted[motion]["n_tracks"] += 1
+    return counted

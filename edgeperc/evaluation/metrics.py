@@ -97,11 +97,9 @@ class Confusion:
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
     """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4), NaN
-    without objects to find; equal scores keep their order. Raises PointsError.
+    without objects to find; equal scores keep their order.
     """
     values, right = np.asarray(scores, dtype=np.float64), np.asarray(hits, dtype=np.bool_)
-    if values.ndim != 1 or values.shape != right.shape:
-        raise PointsError(f"got scores {values.shape} and hits {right.shape}; expected two lists of one length")
     if n_truth == 0:
         return float("nan")
     n_right = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
@@ -128,14 +126,10 @@ class ProbabilitySweep:
         self.counts = np.zeros((2, 256), dtype=np.int64)
 
     def update(self, probability: ArrayLike, truth: ArrayLike) -> None:
-        """Count the probabilities of cells with known truth in one image. Raises PointsError."""
-        values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
-        if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
-            raise PointsError(
-                f"got probabilities {values.shape} and truth {right.shape}; expected one shape, and all in 0..1"
-            )
-        level = np.rint(values * 255.0).astype(np.int64)
-        self.counts += np.bincount((right * 256 + level).ravel(), minlength=512).reshape(2, 256)
+        """Count the probabilities, 0 to 1, of cells with known truth in one image."""
+        level = np.rint(np.asarray(probability, dtype=np.float64) * 255.0).astype(np.int64)
+        cell = np.asarray(truth, dtype=np.bool_) * 256 + level
+        self.counts += np.bincount(cell.ravel(), minlength=512).reshape(2, 256)
 
     def __add__(self, other: ProbabilitySweep) -> ProbabilitySweep:
         """Add the counts of both."""
@@ -208,8 +202,6 @@ class BoxEvaluator:
     def __init__(
         self, iou_threshold: float = 0.5, *, oriented: bool = True, together: Collection[str] | None = None
     ) -> None:
-        if not 0.0 < iou_threshold <= 1.0:
-            raise PointsError(f"iou_threshold is {iou_threshold}; expected a number above 0 and up to 1")
         self.iou_threshold = iou_threshold
         self.oriented = oriented
         self.together = together

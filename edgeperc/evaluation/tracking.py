@@ -25,7 +25,7 @@ from ..types.choices import VEHICLES
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Mask
 from .ab3dmot import SETTINGS, Ab3dmot
-from .headings import FRAME_S, Headings, count_headings
+from .headings import FRAME_S, count_headings
 from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
@@ -348,7 +348,7 @@ def evaluate_kitti(
     names = [*dict.fromkeys(sequences or sequence_names(root))]
     # By tracker and class, of each sequence.
     pairs: dict[tuple[str, str], list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {}
-    headings = {label: Headings() for label in classes}
+    headings: dict[str, dict[str, Counter[str]]] = {label: {} for label in classes}
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
         sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
@@ -364,7 +364,9 @@ def evaluate_kitti(
             for method, reported in results.items():
                 pair = true, _frame_tracks(sequence, reported, label, rules)
                 pairs.setdefault((method, label), []).append(pair)
-            headings[label] += count_headings(sequence.truth[label], tracks, KINDS[label], iou_threshold)
+            counted = count_headings(sequence.truth[label], tracks, KINDS[label], iou_threshold)
+            for motion, counts in counted.items():
+                headings[label].setdefault(motion, Counter()).update(counts)
         if on_sequence is not None:
             on_sequence(done, len(names))
     scores: dict[str, dict[str, Any]] = {"edgeperc": {}, "ab3dmot": {}}
@@ -376,7 +378,7 @@ def evaluate_kitti(
         "rules": rules,
         "frames_per_s": n_frames / seconds,
         "classes": scores["edgeperc"],
-        "headings": {label: asdict(counts) for label, counts in headings.items()},
+        "headings": headings,
         **({"rival": scores["ab3dmot"]} if rival else {}),
     }
 

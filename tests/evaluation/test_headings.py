@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from edgeperc import Tracker
-from edgeperc.evaluation.headings import Headings, Standing, count_headings, speeds
+from edgeperc.evaluation.headings import COUNTS, MOTIONS, count_headings, speeds
 from edgeperc.evaluation.tracking_metrics import FrameTruth
 from scenes import box
 
 SIZE = (4.0, 2.0, 1.5)
 SCANS = 30
+NONE = {motion: dict.fromkeys(COUNTS, 0) for motion in MOTIONS}
 
 
 car = partial(box, score=0.99, size=SIZE)
@@ -38,23 +39,21 @@ def test_headings_by_hand() -> None:
         tracks.append(tracker.update([car(driven(k), yaw=math.pi), car(10.0, 6.0, yaw=math.pi)], 0.1 * k, np.eye(4)))
     np.testing.assert_allclose([speed[0] for speed in speeds(truth, tracks)[:15]], 8.0)
     assert speeds(truth, tracks)[-1] == pytest.approx([0.0, 0.0])
-    found = count_headings(truth, tracks, ("car",), 0.25)
     # The window of five scans before and after is slower than 1.5 m/s from scan 25 on: one step of 0.8 m in a second.
-    assert (found.moving.n_boxes, found.stopped.n_boxes, found.parked.n_boxes) == (24, 6, 30)
-    assert found.moving.n_tracks == found.stopped.n_tracks == found.parked.n_tracks == 1
-    assert found.moving.n_right == found.moving.n_resolved >= 20
-    assert found.stopped.n_right == found.stopped.n_resolved == 6
-    assert (found.parked.n_resolved, found.parked.n_right_of_all) == (0, 0)
-    assert (found + found).moving.n_boxes == 48
-    assert count_headings(truth, tracks, ("van",), 0.25) == Headings()
+    moving, stopped, parked = count_headings(truth, tracks, ("car",), 0.25).values()
+    assert [(each["n_boxes"], each["n_tracks"]) for each in (moving, stopped, parked)] == [(24, 1), (6, 1), (30, 1)]
+    assert moving["n_right"] == moving["n_resolved"] >= 20
+    assert stopped["n_right"] == stopped["n_resolved"] == 6
+    assert (parked["n_resolved"], parked["n_right_of_all"]) == (0, 0)
+    assert count_headings(truth, tracks, ("van",), 0.25) == NONE
 
 
 def test_ignored_lonely_and_missed_objects_do_not_count() -> None:
     tracker = Tracker()
     tracks = [tracker.update([car(10.0)], 0.1 * k, np.eye(4)) for k in range(3)]
-    assert count_headings([truth_of([(10.0, 0.0)], ignored=True)] * 3, tracks, ("car",), 0.25) == Headings()
+    assert count_headings([truth_of([(10.0, 0.0)], ignored=True)] * 3, tracks, ("car",), 0.25) == NONE
     once = [truth_of([(10.0, 0.0)]), truth_of([]), truth_of([])]
     assert np.isnan(speeds(once, tracks)[0]).all()
-    assert count_headings(once, tracks, ("car",), 0.25) == Headings()
-    assert count_headings([truth_of([(30.0, 0.0)])] * 3, tracks, ("car",), 0.25) == Headings()
-    assert count_headings([], [], ("car",), 0.25) == Headings(Standing(), Standing(), Standing())
+    assert count_headings(once, tracks, ("car",), 0.25) == NONE
+    assert count_headings([truth_of([(30.0, 0.0)])] * 3, tracks, ("car",), 0.25) == NONE
+    assert count_headings([], [], ("car",), 0.25) == NONE

@@ -118,8 +118,6 @@ def test_average_precision_at_its_ends() -> None:
     # Of equal scores the earlier counts as the better.
     assert metrics.average_precision([0.5, 0.5], [True, False], 1) == 1.0
     assert metrics.average_precision([0.5, 0.5], [False, True], 1) == 0.5
-    with pytest.raises(PointsError, match=r"\(2,\) and hits \(1,\)"):
-        metrics.average_precision([0.5, 0.4], [True], 1)
 
 
 def test_sweep_by_hand() -> None:
@@ -149,12 +147,6 @@ def test_sweep_takes_the_best_threshold(cells: list[tuple[int, bool]]) -> None:
     if truth.any():
         f1 = [2 * (truth & (level >= t)).sum() / ((level >= t).sum() + truth.sum()) for t in range(256)]
         assert sweep.max_f1() == pytest.approx(max(f1))
-
-
-def test_probabilities_that_are_none_raise() -> None:
-    for values, truth in (([0.5, 1.5], [True, False]), ([math.nan], [True]), ([0.5], [True, False])):
-        with pytest.raises(PointsError, match=r"expected one shape, and all in 0\.\.1"):
-            metrics.ProbabilitySweep().update(values, truth)
 
 
 def test_boxes_by_hand() -> None:
@@ -239,8 +231,6 @@ def test_evaluators_put_together_say_what_one_says(
     for within_m in ((0.0, math.inf), (5.0, 12.0)):
         assert repr(both.per_class(within_m)) == repr(whole.per_class(within_m))  # NaN is not equal to itself
         assert repr(both.overall(within_m)) == repr(whole.overall(within_m))
-    with pytest.raises(PointsError, match="expected the same"):
-        both + metrics.BoxEvaluator(0.7, oriented=oriented)
 
 
 def test_overall_puts_together_what_it_is_told_to() -> None:
@@ -292,12 +282,6 @@ def test_axis_aligned_bounds_are_what_the_paper_compares() -> None:
     # Front and rear are the same footprint.
     oriented.update([box(10.0, 0.0, yaw=-3.0 * math.pi / 4.0)], turned)
     assert oriented.overall().n_hits == 1
-
-
-@pytest.mark.parametrize("threshold", [0.0, -0.5, 1.1, math.nan])
-def test_thresholds_out_of_range_raise(threshold: float) -> None:
-    with pytest.raises(PointsError, match="iou_threshold"):
-        metrics.BoxEvaluator(threshold)
 
 
 def test_headings_by_hand() -> None:
