@@ -258,14 +258,19 @@ class KittiObjects:
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        labels = self.root / "training/label_2"
-        rows = _frame_rows(self.root) or [
-            {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("[!.]*.txt"))
-        ]
+        paths, table = sorted((self.root / "training/label_2").glob("[!.]*.txt")), _frame_rows(self.root)
+        labeled = dict.fromkeys(path.stem for path in paths)
+        rows = table or [{"name": name, "drive": name} for name in labeled]
         self.drives = {row["name"]: row["drive"] for row in rows}
-        self.grades = {r["name"]: r.get("grade") or "A" for r in rows if (labels / f"{r['name']}.txt").exists()}
+        self.grades = {row["name"]: row.get("grade") or "A" for row in rows if row["name"] in labeled}
+        self.has_table, self.unlisted = bool(table), [name for name in labeled if name not in self.drives]
         if not self.grades:
-            raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
+            raise PointsError(
+                f"{self.root}: frames*.csv has no row of a scan in training/label_2, such as {self.unlisted[0]}, but "
+                f"of {rows[0]['name']!r:.60}; expected the names of the files, without the suffix"
+                if self.unlisted
+                else f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set"
+            )
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""

@@ -101,9 +101,12 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     check_different(datasets)
-    for root in filter(_is_kitti, map(Path, datasets)):
-        if not any(root.glob("frames*.csv")):
-            _tell_no_drives(root, "none is held back. docs/concepts/measure.md shows how to write it")
+    for objects in map(KittiObjects, filter(_is_kitti, map(Path, datasets))):
+        if not objects.has_table:
+            _tell_no_drives(objects.root, "none is held back. docs/concepts/measure.md shows how to write it")
+        elif objects.unlisted:
+            told = f"{len(objects.unlisted):,} labeled scans without a row in frames*.csv, which are left out"
+            warnings.warn(f"{objects.root} has {told}", stacklevel=2)
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     folders = job.folders()
