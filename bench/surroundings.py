@@ -15,6 +15,7 @@ import numpy as np
 
 from edgeperc import Perceiver, occupancy_grid
 from edgeperc.datasets.scan_folder import ScanFolder
+from edgeperc.datasets.splits import names_of
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.truth import road_cells
 from edgeperc.road.grid import ALL_AROUND
@@ -44,7 +45,7 @@ def streets() -> Iterator[tuple[Points, Bytes]]:
 def labeled(folder: ScanFolder) -> Iterator[tuple[Points, Bytes]]:
     """Scans of the test drives of a set."""
     perceive = Perceiver("sceneseg", sensor=folder.layout.sensor, on_mismatch="ignore")
-    for name in folder.names("test"):
+    for name in names_of(folder, "test"):
         frame = folder.frame(name)
         cells = road_cells(frame, perceive(frame.points).mounting, VIEW)
         if cells is not None:

@@ -8,7 +8,10 @@ Shipped models are compared on the validation drives.
 
 from __future__ import annotations
 
-from ..errors import OptionError
+from pathlib import Path
+from typing import Protocol
+
+from ..errors import OptionError, PointsError
 
 
 def _drives(*names: str) -> frozenset[str]:
@@ -60,3 +63,24 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
     if drive_fold is None:
         return split in (("all", "test") if drive in TEST_DRIVES else ("all", "test", "train"))
     return split in ("all", "validation" if drive_fold == fold else "train")
+
+
+class LabeledScans(Protocol):
+    """A data set."""
+
+    root: Path
+
+    def names(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names of the labeled scans of a split."""
+
+
+def names_of(scans: LabeledScans, split: str, fold: int | None = None) -> list[str]:
+    """Names of the scans of a split, "held-back" too: validation and test. PointsError without any."""
+    parts = ("validation", "test") if split == "held-back" else (split,)
+    names = [name for part in parts for name in scans.names(part, fold=fold)]
+    if not names:
+        raise PointsError(
+            f"{scans.root} has no scans of the {split} drives (fold: {fold}); ask for another split, or all, or list "
+            "drives for this one: 'splits' in the description of a set"
+        )
+    return names

@@ -18,6 +18,7 @@ from typing import Any, Literal
 from ..datasets.kitti import KittiObjects, SemanticKitti
 from ..datasets.layout import known_layouts
 from ..datasets.scan_folder import ScanFolder
+from ..datasets.splits import names_of
 from ..errors import OptionError, PointsError
 from ..perceiver import Learned, Perceiver
 from ..system.pool import MOST_FIRST, taken
@@ -252,12 +253,7 @@ def _check_names(folders: Sequence[ScanFolder]) -> None:
 
 
 def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None) -> list[str]:
-    parts = ("validation", "test") if split == "held-back" else (split,)
-    names = [name for part in parts for name in scans.names(part, fold=fold)]
-    if not names:
-        raise PointsError(
-            f"{scans.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
-        )
+    names = names_of(scans, split, fold)
     files = [] if isinstance(scans, ScanFolder) else [(name, file) for name in names for file in scans.files(name)]
     if lacking := {name: file for name, file in files if not file.exists()}:  # now, not after hours
         raise PointsError(

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..datasets.layout import class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
+from ..datasets.splits import names_of
 from ..errors import ModelError, PointsError, SensorError, SplitError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_estimate import MOST_SCANS, estimate_sensor
@@ -82,7 +83,7 @@ def compare(
     sets = {name: _dataset(name) for name in datasets}
     for sensor, _, _, folder in sets.values():
         if folder is not None:
-            check_unit(folder, sensor, _names(folder))
+            check_unit(folder, sensor, names_of(folder, "test"))
     sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
     total, done, result = sum(sizes.values()), 0, dict[str, Any]()
 
@@ -208,7 +209,12 @@ def _dataset(name: str) -> _DataSet:
 
 def _of_folder(folder: ScanFolder, sensor: SensorProfile | None = None) -> _DataSet:
     with_boxes = folder if folder.layout.boxes else None
-    return sensor or folder.layout.sensor, len(_names(folder)), lambda: map(_of_frame, _frames(folder)), with_boxes
+    return (
+        sensor or folder.layout.sensor,
+        len(names_of(folder, "test")),
+        lambda: map(_of_frame, _frames(folder)),
+        with_boxes,
+    )
 
 
 def _folder(source: str, others: str = "SENSOR=simulation:N, SENSOR=FOLDER of range images NAME.npy") -> ScanFolder:
@@ -221,18 +227,7 @@ def _folder(source: str, others: str = "SENSOR=simulation:N, SENSOR=FOLDER of ra
 
 
 def _frames(folder: ScanFolder) -> Iterator[ScanFrame]:
-    return map(folder.frame, _names(folder))
-
-
-def _names(folder: ScanFolder) -> list[str]:
-    """The scans that are compared; PointsError without any."""
-    names = folder.names("test")
-    if not names:
-        raise PointsError(
-            f"{folder.root} has no scans of test drives, which sensors are compared on; list some as 'test' in the "
-            "splits of its description, or leave splits out"
-        )
-    return names
+    return map(folder.frame, names_of(folder, "test"))
 
 
 def _of_frame(frame: ScanFrame) -> Scan:

@@ -20,6 +20,7 @@ from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiLabels, KittiObjects, SemanticKitti
 from edgeperc.datasets.layout import class_number
 from edgeperc.datasets.scan_folder import ScanFolder
+from edgeperc.datasets.splits import names_of
 from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.camvid import check_classes
 from edgeperc.evaluation.judge import Judge, Perceiving
@@ -175,7 +176,7 @@ def _measure(
         judge, *of_sets = judges
         if kitti is not None:
             objects = KittiObjects(kitti)
-            for name in _spread(objects.names(split), n_scans):
+            for name in _spread(names_of(objects, split), n_scans):
                 frame = objects.frame(name)
                 truth = judge.kitti(frame if sparse is None else thinned(frame, sparse))
                 yield "real", judge, truth, judge.perceive(truth.points), None
@@ -185,7 +186,7 @@ def _measure(
                 truth = judge.semantickitti(roads.frame(name))
                 yield "road", judge, truth, judge.perceive(truth.points), None
         for folder, judge in zip(labeled, of_sets, strict=True):
-            for name in _spread(folder.names(split), n_scans):
+            for name in _spread(names_of(folder, split), n_scans):
                 yield folder.layout.name, judge, *judge.perceive_frame(folder.frame(name))
 
     records: dict[str, list[Record]] = {}
@@ -219,7 +220,7 @@ def _measure_objects(
     )
     session = next(session for session in perceive.sessions if session.card.view.kind == "objects")
     labels, overlaps, table = [], [], Listed()
-    for name in _spread(objects.names(split), n_scans):
+    for name in _spread(names_of(objects, split), n_scans):
         frame = objects.frame(name)
         truth = FrontTruth(frame.labels or NO_LABELS, frame.calibration, image_size_of(frame.drive))
         boxes = perceive(frame.points).boxes

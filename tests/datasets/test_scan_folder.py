@@ -810,7 +810,7 @@ def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, shell: Sh
     for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
         assert "SENSOR=simulation:N" in shell.err("eval-sensors", source)
     kept = folder_of(tmp_path / "kept", {**DESCRIPTION, "splits": {"train": ["*"]}}, label__a_dot_txt=LINES)
-    assert "has no scans of test drives" in shell.err("eval-sensors", kept)
+    assert "has no scans of the test drives" in shell.err("eval-sensors", kept)
 
 
 def test_public_sets(data_root: Callable[[str], Path]) -> None:

@@ -63,6 +63,11 @@ def test_files_must_be_of_one_network_and_one_in_fp32(tmp_path: Path) -> None:
     shutil.copy(model_path("pointseg"), path)
     with pytest.raises(PointsError, match="name a KITTI object set"):
         agree([path], kitti=None)
+    (tmp_path / "training/label_2").mkdir(parents=True)
+    (tmp_path / "training/label_2/000000.txt").touch()  # of a drive of its own, for training and testing
+    for model in (path, "objects:fp32"):
+        with pytest.raises(PointsError, match="no scans of the validation drives"):
+            agree([model], kitti=tmp_path)
     assert path.read_bytes() == model_path("pointseg").read_bytes()
 
 
