@@ -103,12 +103,7 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
     if n_truth == 0:
         return float("nan")
     n_right = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
-    return _eleven_points(n_right, np.arange(1, len(n_right) + 1), n_truth)
-
-
-def _eleven_points(found: Ints64, predicted: Ints64, n_truth: int) -> float:
-    """Eleven-point average precision; both counts are cumulative, (k,), over falling thresholds."""
-    return interpolated_precision(found, predicted, n_truth, np.arange(11), 10)
+    return interpolated_precision(n_right, np.arange(1, len(n_right) + 1), n_truth, np.arange(11), 10)
 
 
 def interpolated_precision(found: Ints64, predicted: Ints64, n_truth: int, levels: Ints64, n_levels: int) -> float:
@@ -146,7 +141,7 @@ class ProbabilitySweep:
     def average_precision(self) -> float:
         """Eleven-point average precision over the thresholds; NaN if the class does not occur."""
         n_truth = int(self.counts[1].sum())
-        return _eleven_points(*self._above(), n_truth) if n_truth else float("nan")
+        return interpolated_precision(*self._above(), n_truth, np.arange(11), 10) if n_truth else float("nan")
 
     def _above(self) -> tuple[Ints64, Ints64]:
         """True positives and positives, (256,) each, from the highest threshold to the lowest."""

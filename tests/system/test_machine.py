@@ -271,21 +271,18 @@ def test_a_compiled_model_that_is_damaged_is_compiled_again(
 ) -> None:
     """OpenVINO loads it, and its labels are others: after a power failure, blocks of a new file may be zeros."""
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
-    asked = "a", "f" * 64, "fp32"
-    folder = machine.compiled_folder(*asked)
+    folder = machine.compiled_folder("a", "f" * 64, "fp32")
     assert folder is not None
-    blob = folder / "1.blob"
-    blob.write_bytes(bytes(range(200)))
-    assert machine.compiled_folder(*asked) == folder
-    assert not blob.exists()  # a process ended before it was noted
-    blob.write_bytes(bytes(range(200)))
-    machine.keep_compiled(folder)
-    assert machine.compiled_folder(*asked) == folder
-    assert blob.exists()
-    assert not caplog.messages
-    blob.write_bytes(bytes(200))
-    assert machine.compiled_folder(*asked) == folder
-    assert not [*folder.iterdir()]
+    # First as of a process that ended before it was noted; then whole; then damaged.
+    for is_noted, damage, left in ((False, b"", []), (True, b"", ["1.blob", "sha256"]), (True, b"\0", [])):
+        (folder / "1.blob").write_bytes(b"weights")
+        if is_noted:
+            machine.keep_compiled(folder)
+        assert not caplog.messages
+        with (folder / "1.blob").open("r+b") as blob:
+            blob.write(damage)
+        assert machine.compiled_folder("a", "f" * 64, "fp32") == folder
+        assert sorted(file.name for file in folder.iterdir()) == left
     assert "is damaged, and is compiled again" in caplog.text
 
 
