@@ -265,12 +265,8 @@ class KittiObjects:
         self.grades = {row["name"]: row.get("grade") or "A" for row in rows if row["name"] in labeled}
         self.has_table, self.unlisted = bool(table), [name for name in labeled if name not in self.drives]
         if not self.grades:
-            raise PointsError(
-                f"{self.root}: frames*.csv has no row of a scan in training/label_2, such as {self.unlisted[0]}, but "
-                f"of {rows[0]['name']!r:.60}; expected the names of the files, without the suffix"
-                if self.unlisted
-                else f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set"
-            )
+            listed = f" of a scan in frames*.csv, such as {rows[0]['name']!r:.60}" if table else ""
+            raise PointsError(f"{self.root} has no training/label_2/*.txt{listed}; expected a KITTI object set's root")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""

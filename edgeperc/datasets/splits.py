@@ -8,8 +8,7 @@ Shipped models are compared on the validation drives.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from ..errors import OptionError, PointsError
 
@@ -65,17 +64,8 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
     return split in ("all", "validation" if drive_fold == fold else "train")
 
 
-class LabeledScans(Protocol):
-    """A data set."""
-
-    root: Path
-
-    def names(self, split: str, *, fold: int | None = None) -> list[str]:
-        """Names of the labeled scans of a split."""
-
-
-def names_of(scans: LabeledScans, split: str, fold: int | None = None) -> list[str]:
-    """Names of the scans of a split, "held-back" too: validation and test. PointsError without any."""
+def names_of(scans: Any, split: str, fold: int | None = None) -> list[str]:
+    """Names of a data set's scans of a split, "held-back" too: validation and test. PointsError without any."""
     parts = ("validation", "test") if split == "held-back" else (split,)
     names = [name for part in parts for name in scans.names(part, fold=fold)]
     if not names:

@@ -273,7 +273,7 @@ def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path:
             KittiObjects(tmp_path)
     (tmp_path / "frames-2.csv").unlink()
     (tmp_path / "frames.csv").write_text("name,drive\n1,26\n")  # as spreadsheets write 000001
-    with pytest.raises(PointsError, match=r"no row of a scan in training/label_2, such as 000000, but of '1'"):
+    with pytest.raises(PointsError, match=r"no training/label_2/\*\.txt of a scan in frames\*\.csv, such as '1'"):
         KittiObjects(tmp_path)
 
 

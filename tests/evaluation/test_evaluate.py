@@ -720,7 +720,7 @@ def test_scans_of_drives_listed_nowhere_are_evaluated(world: World, tmp_path: Pa
         result, _ = evaluate.evaluate([root], ["pointseg"])
     assert result["real"]["n_drives"] == 2
     (root / "frames.csv").write_text("name,drive\n000000,mine\n")
-    with pytest.warns(UserWarning, match=r"1 labeled scans, such as 000001, are left out, as frames\*\.csv has no row"):
+    with pytest.warns(UserWarning, match=r"1 labeled scans without a row in frames\*\.csv, which are left out"):
         assert evaluate.evaluate([root], ["pointseg"])[0]["real"]["n_frames"] == 1
     (root / "frames.csv").unlink()
     (root / "training/calib/000001.txt").unlink()
