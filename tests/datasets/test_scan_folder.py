@@ -190,21 +190,23 @@ def test_label_files_of_half_a_number_and_names_that_are_none(tmp_path: Path) ->
         ScanFolder(root).frame("a")
 
 
+BOXES = ("1 2 3", "1 2 3 4 5 six 0", "1 2 3 4 5 inf 0", "1 2 3 4 0 1 0", "nan 2 3 4 1 1 0", "1 2 3 4 2 1 90")
+POLYGONS = ("{", "3", "[[[0, 0], [1, 1]]]", '[[["a", 0]]]', "[[[0,0],[1,1],[1e999,0]]]", "[7]")
+
+
 @pytest.mark.parametrize(
-    "line",
+    ("file", "text", "message"),
     [
-        "Car 1 2 3",
-        "Car 1 2 3 4 5 six 0",
-        "Car 1 2 3 4 5 inf 0",
-        "Car 1 2 3 4 0 1 0",
-        "Car nan 2 3 4 1 1 0",
-        "Car 1 2 3 4 2 1 90",
+        *(("label__a_dot_txt", f"Car 10 0 -1 4 2 1.6 0\nCar {box}\n", r"a\.txt, line 2: .*expected") for box in BOXES),
+        *(("drivable__a_dot_json", text, "polygon") for text in POLYGONS),
+        ("frames_dot_csv", "name,drive\n", "both filled"),
+        ("frames_dot_csv", "name,drive\na,\n", "both filled"),
+        ("frames_dot_csv", "name,drive\nb,x\n", "no drive of a"),
     ],
 )
-def test_lines_that_are_no_boxes(tmp_path: Path, line: str) -> None:
-    folder = ScanFolder(folder_of(tmp_path, label__a_dot_txt=f"Car 10 0 -1 4 2 1.6 0\n{line}\n"))
-    with pytest.raises(PointsError, match=r"label.a\.txt, line 2: .*expected"):
-        folder.frame("a")
+def test_files_that_are_wrong(tmp_path: Path, file: str, text: str, message: str) -> None:
+    with pytest.raises(PointsError, match=message):
+        ScanFolder(folder_of(tmp_path, **{"label__a_dot_txt": "", file: text})).frame("a")
 
 
 def test_boxes_of_a_class_that_is_not_mapped(tmp_path: Path) -> None:
@@ -424,22 +426,6 @@ def test_sets_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert joined_hashes(one, one) == one
     with pytest.raises(PointsError, match="both called 'street', and both have a drive 'street'"):
         evaluate([folder.root for folder in folders], ["pointseg"])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("name,drive\n", "both filled"), ("name,drive\na,\n", "both filled"), ("name,drive\nb,x\n", "no drive of a")],
-)
-def test_tables_without_drives(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(PointsError, match=message):
-        ScanFolder(folder_of(tmp_path, label__a_dot_txt="", frames_dot_csv=text))
-
-
-@pytest.mark.parametrize("text", ["{", "3", "[[[0, 0], [1, 1]]]", '[[["a", 0]]]', "[[[0,0],[1,1],[1e999,0]]]", "[7]"])
-def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
-    folder = ScanFolder(folder_of(tmp_path, drivable__a_dot_json=text))
-    with pytest.raises(PointsError, match="polygon"):
-        folder.frame("a")
 
 
 @pytest.mark.parametrize(
