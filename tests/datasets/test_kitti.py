@@ -260,7 +260,6 @@ def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path:
     objects = KittiObjects(tmp_path)
     assert objects.drives == {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0001"}
     assert objects.names("test", grades="AB") == ["000000"]
-    assert objects.unlisted == ["000002"]
     (tmp_path / "frames-2.csv").write_text("name,drive,grade\n000001,2011_09_26_drive_0001\n")
     assert KittiObjects(tmp_path).names("validation") == ["000001"]  # not graded
     assert objects.names("validation", grades="AB") == ["000001"]

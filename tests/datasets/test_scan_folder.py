@@ -221,16 +221,12 @@ def test_boxes_of_a_class_that_is_not_mapped(tmp_path: Path) -> None:
 
 
 def test_kittis_own_labels(tmp_path: Path) -> None:
-    calibration = (
-        "P2: 721.5 0 609.5 0 0 721.5 172.9 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
-        "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
-    )
-    root = folder_of(
-        tmp_path,
-        {**DESCRIPTION, "box_format": "kitti"},
-        label_2__a_dot_txt="Car 0 0 0 600 150 700 250 1.6 2 4 0 1.72 9.73 -1.5708\n",
-        calib__a_dot_txt=calibration,
-    )
+    files = {
+        "label_2__a_dot_txt": "Car 0 0 0 600 150 700 250 1.6 2 4 0 1.72 9.73 -1.5708\n",
+        "calib__a_dot_txt": "P2: 721.5 0 609.5 0 0 721.5 172.9 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+        "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n",
+    }
+    root = folder_of(tmp_path, {**DESCRIPTION, "box_format": "kitti"}, **files)
     frame = ScanFolder(root).frame("a")
     assert frame.labels().tolist() == [1, 0, IGNORE, 0]  # behind the camera nothing is labeled
     assert frame.azimuths == pytest.approx((-0.7196, 0.7012), abs=1e-3)

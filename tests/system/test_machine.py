@@ -264,6 +264,11 @@ def test_compiled_folder_depends_on_engine_model_and_precision(monkeypatch: pyte
     assert machine.compiled_folder(*asked[0]) == folders[0]
     monkeypatch.setattr(machine, "fingerprint", lambda: "another computer")
     assert machine.compiled_folder(*asked[0]) not in folders
+    monkeypatch.setattr(os, "access", lambda *_: False)  # it is read-only
+    assert machine.compiled_folder(*asked[0]) is None
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert machine.compiled_folder(*asked[1]) is None
 
 
 def test_a_compiled_model_that_is_damaged_is_compiled_again(
@@ -284,15 +289,6 @@ def test_a_compiled_model_that_is_damaged_is_compiled_again(
         assert machine.compiled_folder("a", "f" * 64, "fp32") == folder
         assert sorted(file.name for file in folder.iterdir()) == left
     assert "is damaged, and is compiled again" in caplog.text
-
-
-def test_read_only_cache_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
-    assert machine.compiled_folder("a", "f" * 64, "fp32") is None
-    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    assert machine.compiled_folder("a", "f" * 64, "fp32") is None
 
 
 def test_equal_computers_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
