@@ -153,7 +153,7 @@ class MountingEstimator:
         if self.known.origin_m != (0.0, 0.0):
             scan = points - np.array([*self.known.origin_m, 0.0, 0.0], np.float32)
         # From a given tilt on: the ground of a sensor that hangs upside down is above it in the scan.
-        found = replace(_filled(self.known, _values(MODEL_MOUNTING)), height_m=MODEL_HEIGHT_M)
+        found = replace(_usual(self.known, self.known.yaw_deg), height_m=MODEL_HEIGHT_M)
         found = replace(found, yaw_deg=self.known.yaw_deg or 0.0, origin_m=(0.0, 0.0))
         found, support, uncertainty = _leveled(scan, found, self.known.height_m)
         yaw_deg = _street_axis(ModelFrame(found).move(scan)) if self.known.yaw_deg is None else self.known.yaw_deg
@@ -165,7 +165,7 @@ class MountingEstimator:
     def contradicted_by(self, points: Points) -> Mounting | None:
         """The mounting by the ground in a scan, if the given roll or pitch is another; None if not, or unsure."""
         given = _values(self.known)[1:3]
-        start = replace(_filled(self.known, _values(MODEL_MOUNTING)), yaw_deg=self.known.yaw_deg or 0.0)
+        start = replace(_usual(self.known, self.known.yaw_deg), yaw_deg=self.known.yaw_deg or 0.0)
         level = replace(start, roll_deg=180.0 * round((start.roll_deg or 0.0) / 180.0), pitch_deg=0.0)
         for guess in (start, level):  # the ground is found from up to 16 degrees off
             try:
@@ -195,10 +195,11 @@ class MountingEstimator:
         found, uncertainty = scans[:, :4], np.median(scans[:, 5:], axis=0)
         spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
         of_one = [np.interp(support, _SUPPORT, sd) for sd in (_HEIGHT_SD_M, _ROLL_SD_DEG, _PITCH_SD_DEG)]
-        of_plane = np.hypot(of_one, uncertainty)
+        middle = _filled(known, np.median(found, axis=0))
+        of_height, *of_tilt = np.hypot(of_one, uncertainty).tolist()
+        of_plane = [of_height, *_turned_limits(*of_tilt, middle.yaw_deg)]
         sd = np.hypot([*of_plane, _STREET_YAW_SD], spread / math.sqrt(len(found)))
         height, roll, pitch, yaw = np.where(np.isnan(_values(known)), sd, 0.0).tolist()
-        middle = _filled(known, np.median(found, axis=0))
         return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))
 
     def mounting(self) -> Mounting:
@@ -207,10 +208,10 @@ class MountingEstimator:
         It is the training vehicle's as well if no scan showed the ground. Given values are kept. A roll or pitch that
         differs by more, but by less than two standard deviations, is not used (`doubtful`).
         """
-        usual = _filled(self.known, _values(MODEL_MOUNTING))
         if self.known.is_known or not self._found:
-            return usual
+            return _usual(self.known, self.known.yaw_deg)
         found = self.estimate().mounting
+        usual = _usual(self.known, found.yaw_deg)
         off, same, sure = self._compared()
         if (off <= np.maximum(same, sure)).all():
             return usual
@@ -241,11 +242,12 @@ class MountingEstimator:
         and twice the standard deviation.
         """
         found = self.estimate()
-        off = np.abs(_values(found.mounting) - _values(_filled(self.known, _values(MODEL_MOUNTING))))
+        yaw_deg = found.mounting.yaw_deg
+        off = np.abs(_values(found.mounting) - _values(_usual(self.known, yaw_deg)))
         sure = 2.0 * np.array(
             [min(found.height_sd_m, 0.5 * OTHER_HEIGHT_M), found.roll_sd_deg, found.pitch_sd_deg, 0.0]
         )
-        return off, np.array([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0]), sure
+        return off, np.array([SAME_HEIGHT_M, *_turned_limits(SAME_ROLL_DEG, SAME_PITCH_DEG, yaw_deg), 0.0]), sure
 
 
 def _values(mounting: Mounting) -> Floats:
@@ -259,6 +261,26 @@ def _filled(mounting: Mounting, values: Floats) -> Mounting:
     own = _values(mounting)
     height_m, roll_deg, pitch_deg, yaw_deg = np.where(np.isnan(own), values, own).tolist()
     return Mounting(height_m, roll_deg, pitch_deg, yaw_deg, mounting.origin_m)
+
+
+def _usual(known: Mounting, yaw_deg: float | None) -> Mounting:
+    """The mounting with the training vehicle's values where its own are None. That vehicle looks down ahead: a scan
+    whose x axis points elsewhere has another part of this tilt in its roll and pitch.
+    """
+    yaw = math.radians(yaw_deg or 0.0)
+    height_m, roll_deg, pitch_deg, _ = _values(MODEL_MOUNTING).tolist()
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    tilt = (cos * roll_deg + sin * pitch_deg, cos * pitch_deg - sin * roll_deg)
+    return _filled(known, np.array([height_m, *tilt, 0.0]))
+
+
+def _turned_limits(roll_deg: float, pitch_deg: float, yaw_deg: float | None) -> tuple[float, float]:
+    """By how much roll and pitch of a scan turned by a yaw differ if those about the vehicle's axes do by so much, in
+    one of the two alone unless the yaw is a multiple of 90 degrees.
+    """
+    yaw = math.radians(yaw_deg or 0.0)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return math.hypot(cos * roll_deg, sin * pitch_deg), math.hypot(sin * roll_deg, cos * pitch_deg)
 
 
 def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mounting, float, Floats]:

@@ -280,6 +280,19 @@ def test_real_scans_give_the_applied_mounting_and_an_honest_uncertainty(kitti_ro
     assert (within.mean(axis=0) >= 0.9).all(), within.mean(axis=0)
 
 
+@pytest.mark.parametrize("yaw_deg", [-90.0, 180.0])
+def test_a_turned_scan_is_leveled_as_the_same_scan_ahead(scans: list[NDArray[np.float32]], yaw_deg: float) -> None:
+    """The tilt of the training vehicle, and what streets differ by, are about the vehicle's axes, not the scan's."""
+    for tilt in ((0.0, 0.0), (2.0, -0.8), (0.0, 3.0)):
+        scan, turn = seen_by(Mounting(1.73, *tilt, 0.0), scans[0]), Mounting(0.0, 0.0, 0.0, yaw_deg).rotation()
+        ahead = MountingEstimator(Mounting()).add(scan).mounting()
+        scan[:, :3] = scan[:, :3] @ turn
+        aside = MountingEstimator(Mounting(yaw_deg=yaw_deg)).add(scan).mounting()
+        np.testing.assert_allclose(ModelFrame(aside).R, ModelFrame(ahead).R @ turn, atol=1e-3)
+    unseen = MountingEstimator(Mounting(yaw_deg=yaw_deg)).mounting()
+    np.testing.assert_allclose(ModelFrame(unseen).R, turn, atol=1e-3)
+
+
 def test_given_values_are_kept(scans: list[NDArray[np.float32]]) -> None:
     known = Mounting(height_m=2.0, yaw_deg=0.0)
     found = MountingEstimator(known).add(seen_by(Mounting(2.6, 3.0, 0.0, 0.0), scans[0])).estimate()
