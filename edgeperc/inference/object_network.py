@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..ground.scan import Scan
-from ..objects.boxes import join_boxes, not_among
+from ..objects.boxes import distinct_boxes, join_boxes, not_among
 from ..objects.candidate_boxes import (
     LABEL,
     MERGED,
@@ -106,8 +106,8 @@ class ObjectNetwork:
         A vehicle that this network sees at a look has its box, with the mean of both scores; one that it does not see
         is dropped. Of two that share less than half of what both cover, the one with the better score stays. Where
         there are too few points for a look, the other box keeps half of its score. ``by_labels``: others show people,
-        too, by the labels of their points. Their boxes have the mean of both scores, and none is dropped; people
-        without labels keep half of their scores.
+        too, by the labels of their points. Their boxes have the mean of both scores, and stay unless looks move two
+        onto one another; people without labels keep half of their scores.
         Boxes of classes that this network does not know stay where there is no other.
         """
         vehicles, people = _by_kind(objects)
@@ -125,10 +125,13 @@ class ObjectNetwork:
         doubted = not_among([*vehicles, *more], doubted)
         if by_labels:
             doubted += not_among(labeled, people)
-            labeled = [
-                _seen_person(box, look, self.card.classes, min_score)
-                for box, look in zip(labeled, of_people.tolist(), strict=True)
-            ]
+            # Looks move riders' boxes: two around parts of one rider come to lie on one another.
+            labeled = distinct_boxes(
+                [
+                    _seen_person(box, look, self.card.classes, min_score)
+                    for box, look in zip(labeled, of_people.tolist(), strict=True)
+                ]
+            )
         kept = [replace(box, score=0.5 * box.score) for box in doubted if 0.5 * box.score >= min_score]
         joined = join_boxes(vehicles if by_labels else [*vehicles, *people], [*more, *labeled, *kept])
         return join_boxes(joined, [box for box in others if box.label not in self.card.classes])

@@ -42,6 +42,9 @@ MAX_OBJECTS = 1000  # clusters that get a box; 40 KITTI scans have at most 16
 MIN_SIDE_M = 0.1
 MAX_END = 1.4  # a front or a rear is at most this many usual widths wide
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
+# Of two of these and others, the lower limit counts. Boxes of people 0.5 m apart overlap by 0.26. In KITTI's labels,
+# none of 53 pairs of cyclists within 2 m, and none of 67 pairs of a cyclist and a pedestrian, overlaps by 0.05.
+MAX_OVERLAP_OF = MappingProxyType({"pedestrian": 0.3})
 MAX_INSIDE = 0.5  # of the smaller of two footprints
 EVIDENCE = 10.0  # number of points for which this factor of the score is 0.5
 # Of a person, a fifth of those that an HDL-64E gets from 0.85 m2 (1.25 m / distance_per_m / range, squared) and at most
@@ -50,9 +53,6 @@ EVIDENCE = 10.0  # number of points for which this factor of the score is 0.5
 PERSON_POINTS, MAX_EVIDENCE = 1.25, 80.0
 # Heads are not wider; the widest is 0.47 m on the training drives. A rider's back is as high as the head.
 MAX_HEADS_M = MappingProxyType({"pedestrian": 0.55, "cyclist": 0.8})
-# IoU of two persons; the lower limit of the two counts. Boxes of people 0.5 m apart overlap by 0.26. In KITTI's labels,
-# none of 53 pairs of cyclists within 2 m, and none of 67 pairs of a cyclist and a pedestrian, overlaps by 0.05.
-MAX_PERSONS_OVERLAP = MappingProxyType({"pedestrian": 0.3, "cyclist": 0.1})
 MIN_SCORE = 0.3  # precision of cars on KITTI's drive 0005 rose from 0.24 to 0.57, recall stayed at 0.70
 
 
@@ -145,8 +145,7 @@ def objects_from_points(
             spans.append(rectangle)
     boxes = _not_inside(boxes, spans, others)
     persons = [box for box in persons if box.score >= min_score]
-    kept_persons = _distinct(persons, [MAX_PERSONS_OVERLAP[box.label] for box in persons])
-    return join_boxes(_distinct(boxes, [MAX_OVERLAP] * len(boxes)), kept_persons)
+    return join_boxes(distinct_boxes(boxes), distinct_boxes(persons))
 
 
 def _not_inside(boxes: list[Box], spans: Sequence[Floats], others: Sequence[Box]) -> list[Box]:
@@ -189,11 +188,12 @@ def classes_of_boxes(classes: Sequence[str]) -> tuple[str, ...]:
     return (*classes[1:], *by_size)
 
 
-def _distinct(boxes: Sequence[Box], max_overlap: Sequence[float]) -> list[Box]:
+def distinct_boxes(boxes: Sequence[Box]) -> list[Box]:
     """Of boxes that overlap by more than either may, the one with the better score; best score first."""
     if len(boxes) < 2:
         return [*boxes]
-    best = suppress_overlaps(rectangles(boxes), [box.score for box in boxes], max_overlap, max_inside=MAX_INSIDE)
+    limits = [MAX_OVERLAP_OF.get(box.label, MAX_OVERLAP) for box in boxes]
+    best = suppress_overlaps(rectangles(boxes), [box.score for box in boxes], limits, max_inside=MAX_INSIDE)
     return [boxes[row] for row in best]
 
 

@@ -167,6 +167,9 @@ def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan
     assert math.cos(rider.yaw - true.yaw) > 0.9
     assert rider.front > 0.5
     assert math.dist(rider.center[:2], (x, y)) < math.hypot(0.2, 0.1)
+    along = 0.6 * np.array([math.cos(true.yaw), math.sin(true.yaw), 0.0])
+    halves = [replace(labeled, center=tuple(true.center + side * along)) for side in (1.0, -1.0)]
+    assert len(network.complete(seen, clusters, (), halves, True, 0.3)) == 1
 
 
 @pytest.mark.parametrize(("by_labels", "min_score", "score"), [(False, 0.3, 0.9), (True, 0.3, 0.45), (True, 0.6, 0.6)])
