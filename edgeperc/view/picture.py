@@ -282,6 +282,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         if low <= box.center[0] <= high and right <= box.center[1] <= left:
             area = canvas.area_of(axes, footprint[:, ::-1])
             labels.append(canvas.Label(area, f"{box.label} {box.score:.2f}", color))
+    n_farther = len(boxes) - len(labels)
     for kind, x_m in (("obstacle", strip.obstacle_m), ("edge", strip.edge_m), ("unknown", strip.unknown_m)):
         if math.isfinite(x_m):
             axes.plot([-_HALF_STRIP_M, _HALF_STRIP_M], [x_m, x_m], color=INK, linewidth=1.5, zorder=4)
@@ -290,7 +291,8 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     if text:
         labels.append(canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = canvas.place_labels(axes, labels, avoid)
-    seen = _omitted("scores", n_omitted) if n_omitted else "scores; gray: not observed"  # both are wider than the panel
+    seen = f"scores; {n_farther} farther" if n_farther else "scores"
+    seen = _omitted(seen, n_omitted) if n_omitted else f"{seen}; gray: not observed"  # all is wider than the panel
     canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
     return float(axes.get_window_extent().width)
 
@@ -315,7 +317,8 @@ def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float)
     # Percentiles, because stray reflections below the road would compress the image.
     low, high = np.percentile(elevation, [0.3, 99.9]) if len(ahead) else (-25.0, 3.0)
     low, high = low - 0.5, high + 0.5
-    rows = next((n for n in (16, 32, 64) if n >= len(ahead) / columns), 128)
+    # As many as a column of the sensor has points, of some 2048 a turn; gaps between more rows would not be filled.
+    rows = next((n for n in (16, 32, 64) if n >= len(ahead) / (turn_deg / 360.0 * 2048)), 128)
     row = np.floor((high - elevation) / (high - low) * rows).astype(np.intp)
     col = np.floor((half - azimuth[ahead]) / turn_deg * columns).astype(np.intp)
     in_view = (row >= 0) & (row < rows) & (col >= 0) & (col < columns)

@@ -26,9 +26,9 @@ from edgeperc.readers.files import read_points
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
-from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
+from edgeperc.view import canvas, draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
-from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED
+from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED, PANEL
 from edgeperc.view.content import ground_plane, paint_points, paint_vehicles
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -164,6 +164,23 @@ def test_points_of_a_vehicle_have_the_color_of_its_box(label: str, scan: np.ndar
     names, painted = paint_points(scan, seen)
     paint_vehicles(names, painted, scan, seen.boxes)
     assert [names[k] for k in painted[:4]] == [label, label, "car", "car"]
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_a_turn_of_few_beams_has_no_stripes_and_boxes_outside_are_counted(
+    perception: Perception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headings: list[str] = []
+    monkeypatch.setattr(canvas, "write_heading", lambda figure, left, top, heading, more: headings.append(more))
+    azimuth, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 1800), np.radians(np.linspace(-20.0, 10.0, 40)))
+    x, y = 20.0 * np.cos(azimuth), 20.0 * np.sin(azimuth)
+    scan = np.stack([x, y, 20.0 * np.tan(elevation), np.zeros_like(x)], axis=-1).reshape(-1, 4).astype(np.float32)
+    points = PointLabels(np.zeros(len(scan), np.uint8), np.ones(len(scan), bool), POINT_CLASSES)
+    far = replace(CAR, center=(-70.0, 0.0, -0.8))
+    turn = replace(perception, n_points=len(scan), points=points, boxes=(CAR, far))
+    picture = pixels(view.draw(turn, scan))
+    assert not near(picture[720:850, 760:1560], PANEL).any()
+    assert headings[0] == "scores; 1 farther; gray: not observed"
 
 
 @pytest.mark.usefixtures("matplotlib")
