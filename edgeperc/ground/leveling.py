@@ -264,14 +264,12 @@ def _filled(mounting: Mounting, values: Floats) -> Mounting:
 
 
 def _usual(known: Mounting, yaw_deg: float | None) -> Mounting:
-    """The mounting with the training vehicle's values where its own are None. That vehicle looks down ahead: a scan
-    whose x axis points elsewhere has another part of this tilt in its roll and pitch.
+    """The mounting with the training vehicle's values where its own are None. That vehicle's looks down ahead: a scan
+    whose x axis points elsewhere has other parts of this tilt in its roll and pitch.
     """
     yaw = math.radians(yaw_deg or 0.0)
-    height_m, roll_deg, pitch_deg, _ = _values(MODEL_MOUNTING).tolist()
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    tilt = (cos * roll_deg + sin * pitch_deg, cos * pitch_deg - sin * roll_deg)
-    return _filled(known, np.array([height_m, *tilt, 0.0]))
+    height_m, _, pitch_deg, _ = _values(MODEL_MOUNTING).tolist()
+    return _filled(known, np.array([height_m, math.sin(yaw) * pitch_deg, math.cos(yaw) * pitch_deg, 0.0]))
 
 
 def _turned_limits(roll_deg: float, pitch_deg: float, yaw_deg: float | None) -> tuple[float, float]:

@@ -190,8 +190,6 @@ def classes_of_boxes(classes: Sequence[str]) -> tuple[str, ...]:
 
 def distinct_boxes(boxes: Sequence[Box]) -> list[Box]:
     """Of boxes that overlap by more than either may, the one with the better score; best score first."""
-    if len(boxes) < 2:
-        return [*boxes]
     limits = [MAX_OVERLAP_OF.get(box.label, MAX_OVERLAP) for box in boxes]
     best = suppress_overlaps(rectangles(boxes), [box.score for box in boxes], limits, max_inside=MAX_INSIDE)
     return [boxes[row] for row in best]

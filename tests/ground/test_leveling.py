@@ -164,7 +164,7 @@ def test_any_text_is_a_mounting_or_an_error(tmp_path_factory: pytest.TempPathFac
     ],
 )
 def test_impossible_mountings_are_refused(values: dict[str, object]) -> None:
-    with pytest.raises(SensorError, match="mounting"):
+    with pytest.raises(SensorError, match=next(iter(values))):
         Mounting(**values)  # type: ignore[arg-type]
 
 
@@ -420,8 +420,6 @@ def test_a_sensor_that_hangs_is_described(yaw_deg: float) -> None:
     T_vehicle_sensor[:3, :3], T_vehicle_sensor[2, 3] = level.rotation() @ np.diag([1.0, -1.0, -1.0]), 2.1
     for mounting in (Mounting(2.1, 180.0, 0.0, yaw_deg), Mounting.from_matrix(T_vehicle_sensor)):
         np.testing.assert_allclose(ModelFrame(mounting).move(hanging), ModelFrame(level).move(points), atol=1e-4)
-    with pytest.raises(SensorError, match="-180 to 180"):
-        Mounting(2.1, 181.0, 0.0)
 
 
 @pytest.mark.parametrize(
