@@ -196,8 +196,8 @@ class MountingEstimator:
         spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
         of_one = [np.interp(support, _SUPPORT, sd) for sd in (_HEIGHT_SD_M, _ROLL_SD_DEG, _PITCH_SD_DEG)]
         middle = _filled(known, np.median(found, axis=0))
-        of_height, *of_tilt = np.hypot(of_one, uncertainty).tolist()
-        of_plane = [of_height, *_turned_limits(*of_tilt, middle.yaw_deg)]
+        of_height, of_roll, of_pitch = np.hypot(of_one, uncertainty).tolist()
+        of_plane = [of_height, *_turned_limits(of_roll, of_pitch, middle.yaw_deg)]
         sd = np.hypot([*of_plane, _STREET_YAW_SD], spread / math.sqrt(len(found)))
         height, roll, pitch, yaw = np.where(np.isnan(_values(known)), sd, 0.0).tolist()
         return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))

@@ -13,12 +13,15 @@ from ..types.card import ModelCard
 from ..types.geometry import oriented_iou, rectangles, suppress_overlaps
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, read_only
-from .boxes import MAX_INSIDE, MAX_OVERLAP, MAX_OVERLAP_OF
 
 # Columns of decoded boxes.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, YAW, SCORE, LABEL, FRONT = range(10)
 FOOTPRINT = [X, Y, LENGTH, WIDTH, YAW]
 MAX_LOG_SIDE = 1.0  # of a side, divided by the usual one
+# IoU of two objects; the lower limit of the two counts. People stand closer than vehicles.
+MAX_OVERLAP = {"pedestrian": 0.3}
+MAX_OVERLAP_OF_OTHERS = 0.1
+MAX_INSIDE = 0.5  # of the smaller of two footprints
 MERGED = 0.5  # IoU of boxes that are averaged
 LEAST_SCORE = 0.03
 
@@ -54,7 +57,7 @@ def merge_boxes(boxes: Floats, classes: Sequence[str]) -> Floats:
     boxes = boxes[boxes[:, SCORE] >= LEAST_SCORE]
     boxes = boxes[np.argsort(-boxes[:, SCORE], kind="stable")]
     flat = footprints(boxes)
-    limits = np.array([MAX_OVERLAP_OF.get(name, MAX_OVERLAP) for name in classes])[boxes[:, LABEL].astype(int)]
+    limits = np.array([MAX_OVERLAP.get(name, MAX_OVERLAP_OF_OTHERS) for name in classes])[boxes[:, LABEL].astype(int)]
     kept = suppress_overlaps(flat, boxes[:, SCORE], limits, max_inside=MAX_INSIDE)
     merged = boxes[kept]
     fill_merged(boxes, oriented_iou(flat[kept], flat), merged)
