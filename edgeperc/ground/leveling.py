@@ -269,7 +269,7 @@ def _usual(known: Mounting, yaw_deg: float | None) -> Mounting:
     """
     yaw = math.radians(yaw_deg or 0.0)
     height_m, _, pitch_deg, _ = _values(MODEL_MOUNTING).tolist()
-    return _filled(known, np.array([height_m, math.sin(yaw) * pitch_deg, math.cos(yaw) * pitch_deg, 0.0]))
+    return _filled(known, np.array([height_m, math.sin(yaw) * pitch_deg + 0.0, math.cos(yaw) * pitch_deg, 0.0]))
 
 
 def _turned_limits(roll_deg: float, pitch_deg: float, yaw_deg: float | None) -> tuple[float, float]:
