@@ -481,8 +481,13 @@ MODELS = {
     ),
     "objects-open-start": _open(replace(OBJECTS, steps=16_000, detector=False), also=OBJECT_SCANS),
     "objects-open-again-start": _open(OPEN_SECOND_LOOK, after="objects-open-start", also=OBJECT_SCANS),
-    "objects-open": _open(
+    "objects-open-yards-start": _open(
         replace(OPEN_SECOND_LOOK, runs=2), after="objects-open-again-start", also=(*OBJECT_SCANS, "yards")
+    ),
+    "objects-open": _open(
+        replace(OPEN_SECOND_LOOK, steps=9_000, thinned=True),
+        after="objects-open-yards-start",
+        also=(*OBJECT_SCANS, "yards"),
     ),
     "four-classes-start": _open(OPEN_POINTS),
     "scene-start": _open(SCENE, after="four-classes-start", also=("sensors",)),
