@@ -371,7 +371,12 @@ def _add_quantize(command: Command) -> None:
         nargs="*",
         default=[],
     )
-    add("--kitti KITTI", f"{KITTI}; calibrates on training drives, compares on validation drives", type=Path)
+    add(
+        "--kitti KITTI",
+        f"{KITTI}; calibrates on training drives, unless the terms of the weights are not KITTI's; compares on "
+        "validation drives",
+        type=Path,
+    )
     add("--simulated N", "simulated scans to calibrate on (default 64)", type=count, default=64)
     _add_shared(add, "--semantickitti SEMANTICKITTI")
     add("--camvid CAMVID", f"{CAMVID}; for a camera's model: calibrates on training images, not on scans", type=Path)
@@ -407,7 +412,7 @@ def _quantize(args: argparse.Namespace) -> None:
         calibration = calibration_scans(
             [Path(text) for text in args.scans if text not in sets],
             [ScanFolder.parse(text) for text in sets],
-            kitti=args.kitti,
+            kitti=args.kitti if "KITTI" in card.training.get("licence", "KITTI") else None,
             n_simulated=args.simulated,
             fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
             sparse=card.training.get("recipe", {}).get("sparse", False),

@@ -15,10 +15,13 @@ from training_helpers import ablate
 
 from checkout import printed
 from cli_helpers import Shell, parsers
+from edgeperc.errors import PointsError
+from edgeperc.types.card import ModelCard
 from edgeperc.zoo import model_path
 from edgeperc_export.cli import build_parser, recipe_of
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
+from edgeperc_export.release.to_onnx import write_card
 
 
 def test_every_model_can_be_made() -> None:
@@ -111,6 +114,22 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
                 else:
                     arguments += [option, "" if field.default == () else str(field.default)]
         assert recipe_of(build_parser().parse_args(arguments)) == Recipe(network)
+
+
+@pytest.mark.parametrize(("licence", "calibrates"), [("KITTI: CC BY-NC-SA 3.0", True), ("CC BY 4.0", False)])
+def test_weights_without_the_terms_of_kitti_are_not_calibrated_on_it(
+    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch, licence: str, calibrates: bool
+) -> None:
+    model = onnx.load(model_path("objects:fp32"))
+    card = ModelCard.read(model_path("objects:fp32"))
+    write_card(model, dataclasses.replace(card, training={**card.training, "licence": licence}), tmp_path / "mine.onnx")
+
+    def calibration(*_: object, kitti: Path | None, **__: object) -> None:
+        raise PointsError(f"calibrates on KITTI: {kitti is not None}")
+
+    monkeypatch.setattr("edgeperc_export.release.quantize.calibration_scans", calibration)
+    said = shell.err("quantize", tmp_path / "mine.onnx", tmp_path / "int8.onnx", "--kitti", tmp_path)
+    assert f"calibrates on KITTI: {calibrates}" in said
 
 
 def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, shell: Shell) -> None:
