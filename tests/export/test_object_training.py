@@ -59,7 +59,7 @@ from edgeperc_export.training.object_task import Objects, fill_box_ious
 from edgeperc_export.training.start import start
 
 SEED = 4 * 10**9
-RECIPE = replace(MODELS["objects"].recipe, steps=4, batch=16)
+RECIPE = replace(MODELS["objects"].recipe, steps=4, batch=16, kept=0.0)
 
 
 @pytest.fixture(scope="module")
