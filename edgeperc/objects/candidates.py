@@ -111,10 +111,11 @@ def find_candidates(scan: Scan, cells: Cells, distance_per_m: float = 0.015) -> 
     if not 0.0 <= distance_per_m <= 1.0:
         raise PointsError(f"got distance_per_m={distance_per_m}; expected radians in 0..1")
     n_cells = len(cells.flat)
-    around, sizes = np.full(n_cells, -1, np.int32), np.empty(n_cells, np.int32)
+    alone = np.full(n_cells, -1, np.int32), np.empty(n_cells, np.int32)
+    wide: dict[int, tuple[Ints, Ints]] = {}  # of each scale, its groups at the distance for it, and their sizes
     found = []
     for k, per_m in links_of(distance_per_m):
-        scale = SCALES[k]
+        scale, (around, sizes) = SCALES[k], wide.get(k, wide.get(0, alone))
         group, order = np.empty((2, n_cells), np.int32)
         first = np.empty(n_cells + 1, np.int32)
         n_groups = fill_groups_of_cells(cells, k, scale.link_m, per_m, group, order, first)
@@ -123,9 +124,7 @@ def find_candidates(scan: Scan, cells: Cells, distance_per_m: float = 0.015) -> 
             scan.points, scan.ground.height_m, cells, scale, Groups(order, first[: n_groups + 1], around, sizes), fits
         )
         found.append(fits[:n])
-        if k == 0:
-            around = group
-            sizes = np.diff(first[: n_groups + 1])
+        wide.setdefault(k, (group, np.diff(first[: n_groups + 1])))
     return Candidates(np.concatenate(found), cells)
 
 
@@ -142,8 +141,8 @@ class Groups(NamedTuple):
 
     order: Ints  # (k,) numbers of cells, group by group
     first: Ints  # (groups + 1,) where the cells of a group start in ``order``
-    around: Ints  # (cells,) of each cell, its group at the first scale; -1: there is none
-    sizes: Ints  # (groups of the first scale,) numbers of their cells
+    around: Ints  # (cells,) of each cell, its larger group: at the first scale, or linked wider; -1: there is none
+    sizes: Ints  # (larger groups,) numbers of their cells
 
 
 @njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -60,7 +61,7 @@ from ..data.scan_sets import check_trains, read_scan_set
 from ..data.scans import LabeledScan
 from ..data.simulate import TRAINING_SENSOR, parity_samples
 from .int8_graph import equalize, repeat_pixels
-from .to_onnx import halve, pixel_labels, views, write_checked
+from .to_onnx import halve, pixel_labels, sets_of, terms_of, views, write_checked
 
 # Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
@@ -98,8 +99,8 @@ class Calibration(NamedTuple):
 
     scans: Sequence[NDArray[Any] | LabeledScan]
     """(n, 4) float32, or as a training sees them; of a camera's model images (H, W, 3) uint8."""
-    hashes: Sequence[str] = ()
-    """`scan_hash` or `image_hash` of the real ones, for the card: the model is never evaluated on them."""
+    frames: Mapping[str, str] = MappingProxyType({})
+    """Names of the real ones (`sets_of`) -> `scan_hash` or `image_hash`: the model is never evaluated on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,23 +134,30 @@ def calibration_scans(
         drive = _drive(file)
         if drive is not None and not in_split(drive, "train"):
             raise SplitError(f"{file} is of drive {drive}, which is kept for evaluation; calibrate on other drives")
-    real = [read_points(file) for file in files]
-    for file, points in zip(files, real, strict=True):
+    scans: list[NDArray[Any] | LabeledScan] = []
+    frames: dict[str, str] = {}
+    for file in files:
+        points = read_points(file)
         found = check_fitness(points, fitness, get_sensor(TRAINING_SENSOR)) if fitness is not None else ()
         if gross := next((finding for finding in found if finding.gross), None):
             raise PointsError(
                 f"{file} is not as the network sees scans ({gross}) Give scans of another sensor as --scans FOLDER, "
                 "with a scans.json that describes it (docs/howto/train.md)"
             )
+        number = scan_hash(points)
+        name = number if _drive(file) is not None else f"scans to calibrate on/{number}"
+        scans += [points] if name not in frames else []  # the same scan once
+        frames[name] = number
     if kitti is not None:
         objects = KittiObjects(kitti)
-        real += [objects.frame(name).points for name in _few(objects.names("train", grades="AB"))]
-    hashes = [scan_hash(points) for points in real]
-    scans: list[NDArray[Any] | LabeledScan] = [*real]
+        for name in _few(objects.names("train", grades="AB")):
+            scans.append(objects.frame(name).points)
+            frames[name] = scan_hash(scans[-1])
     for folder in sets:
         check_trains(folder, "train")
         of_set, _, own = read_scan_set(folder, "train")
-        scans, hashes = [*scans, *_few(of_set)], [*hashes, *_few([*own.values()])]
+        scans += _few(of_set)
+        frames |= _few([*own.items()])
     scans += [simulated_scan(FIRST_SEED + k).points for k in range(n_simulated)]
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
@@ -158,7 +166,7 @@ def calibration_scans(
         rng = np.random.default_rng(FIRST_SEED)
         every = [scan if isinstance(scan, LabeledScan) else LabeledScan.unlabeled(scan) for scan in scans]
         scans = [taken_by(drawn_sensor(rng, sparse=True), scan, rng, of_any=True) for scan in every]
-    return Calibration(scans, hashes)
+    return Calibration(scans, frames)
 
 
 def _scans_in(folder: Path) -> list[Path]:
@@ -176,8 +184,8 @@ def _few(each: list[T], most: int = 64) -> list[T]:
 def calibration_images(camvid: Path) -> Calibration:
     """64 training images of CamVid, evenly spread."""
     data = LabeledImages(camvid)
-    images = [data.read(file)[0] for file in _few(data.files("train"))]
-    return Calibration(images, [image_hash(image) for image in images])
+    images = {file.stem: data.read(file)[0] for file in _few(data.files("train"))}
+    return Calibration([*images.values()], {name: image_hash(image) for name, image in images.items()})
 
 
 def _drive(file: Path) -> str | None:
@@ -608,16 +616,19 @@ def write_int8(
     compared: Callable[[Path], dict[str, Any]],
 ) -> ModelCard:
     """Write the rounded graph of a model with its card, if ``compared`` with it raises nothing (`write_checked`)."""
-    (scans, hashes), frames = calibration, card.training.get("frames")
-    kinds = f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans"
+    (scans, real), camera = calibration, card.view.kind == "camera"
+    kinds = f"{len(real)} real and {len(scans) - len(real)} simulated scans"
     quantized = {
         "from": f"{card.name} {card.version}",
         "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
-        "calibration": f"{len(hashes)} images" if card.view.kind == "camera" else kinds,
+        "calibration": f"{len(real)} images" if camera else kinds,
         **made,
     }
-    frames = {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})}
-    training = dict(card.training) | {"frames": frames, "quantized": quantized}
+    seen = card.training.get("frames")
+    seen = seen if isinstance(seen, Mapping) else {}
+    new = terms_of(sets_of(real, camera) - sets_of(seen, camera))
+    licence = "; ".join(terms for terms in (card.training.get("licence", ""), new) if terms)
+    training = dict(card.training) | {"frames": {**real, **seen}, "licence": licence, "quantized": quantized}
     model.producer_name, model.producer_version = "edgeperc", ""
     halve(model.graph)
     int8 = replace(card, precision="int8", precisions={}, training=training, parity={})

@@ -63,8 +63,13 @@ FEWEST_HALVED = 1024
 # 0.12 standard deviations.
 UNPOOLING = (LoDNN, SegNet, SSADNet)
 N_GOLDEN_VALUES = 64
-# Terms of weights by the data sets of the real frames; a frame of a set is called SET/NAME.
+CAMVID_SEQUENCES = ("0001TP_", "0006R0_", "0016E5_", "Seq05VD_")
+"""With one of these, the names of its images begin."""
+# Terms of weights by the data sets of the real frames and images.
 TERMS = {
+    "CamVid": (
+        "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
+    ),
     "KITTI": "KITTI: CC BY-NC-SA 3.0",
     "av2": "Argoverse 2: CC BY-NC-SA 4.0",
     "ddad": "DDAD: CC BY-NC-SA 4.0",
@@ -73,11 +78,6 @@ TERMS = {
     "semantickitti": "SemanticKITTI: CC BY-NC-SA 4.0",
     "vod": "View of Delft: research only",
 }
-CAMVID_LICENCE = (
-    "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
-)
-CAMVID_SEQUENCES = ("0001TP_", "0006R0_", "0016E5_", "Seq05VD_")
-"""With one of these, the names of its images begin."""
 
 
 class ParityError(EdgepercError):
@@ -91,9 +91,15 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     return build_network(state, checkpoint).eval(), state["recipe"], notes
 
 
-def terms_of(frames: Iterable[str]) -> str:
-    """Terms of weights that were trained on real scans of these names; empty without one."""
-    sets = {name.partition("/")[0] if "/" in name else "KITTI" for name in frames}
+def sets_of(names: Iterable[str], camera: bool = False) -> set[str]:
+    """The data sets of real frames, SET/NAME or KITTI's, or of a camera's images."""
+    if camera:
+        return {"CamVid" if name.startswith(CAMVID_SEQUENCES) else "images of another set" for name in names}
+    return {name.partition("/")[0] if "/" in name else "KITTI" for name in names}
+
+
+def terms_of(sets: Iterable[str]) -> str:
+    """Terms of weights that were made with scans or images of these sets; empty without one."""
     return "; ".join(TERMS.get(name, f"{name}: terms of that set") for name in sorted(sets))
 
 
@@ -102,17 +108,15 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
     data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
-    licence = terms_of(frames) or notes["licence"]
-    if recipe.task == "camera":
+    camera = recipe.task == "camera"
+    if camera:
         n_camvid = sum(name.startswith(CAMVID_SEQUENCES) for name in frames)
-        n_others, others = len(frames) - n_camvid, "images of another set"
-        of_set = ((n_camvid, "images of CamVid", CAMVID_LICENCE), (n_others, others, f"{others}: terms of that set"))
-        data = ", ".join(f"{n} {images}" for n, images, _ in of_set if n)
-        licence = "; ".join(terms for n, _, terms in of_set if n)
+        of_set = ((n_camvid, "images of CamVid"), (len(frames) - n_camvid, "images of another set"))
+        data = ", ".join(f"{n} {images}" for n, images in of_set if n)
     return {
         "data": data,
         "frames": frames,
-        "licence": licence,
+        "licence": terms_of(sets_of(frames, camera)) or notes["licence"],
         "recipe": json.loads(json.dumps(asdict(recipe))),  # as a card is read again: without tuples
         "steps": notes["step"],
         "started_from": notes["before"],

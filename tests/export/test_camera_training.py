@@ -36,7 +36,7 @@ from edgeperc_export.networks.segnet import VGG_16, SegNet, unpool
 from edgeperc_export.networks.unet import UNet
 from edgeperc_export.recipe import MODELS, PAPER, Recipe
 from edgeperc_export.release.agree import agree
-from edgeperc_export.release.quantize import Calibration, LabeledSets, calibration_images, quantize
+from edgeperc_export.release.quantize import LabeledSets, calibration_images, quantize
 from edgeperc_export.release.to_onnx import export, load, to_graph, verify
 from edgeperc_export.training import camvid
 from edgeperc_export.training import images as camvid_images
@@ -482,13 +482,13 @@ def test_graphs_of_the_comparison_equal_the_networks(name: str) -> None:
 
 
 def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Path) -> None:
-    images, hashes = calibration_images(drawn)
-    assert len(images) == len(hashes) == 6
+    calibration = calibration_images(drawn)
+    assert len(calibration.scans) == len(calibration.frames) == 6
 
     def race(one: Path, other: Path, n_threads: int | None) -> Any:
         return np.linspace(2.0, 2.1, 40), np.linspace(1.0, 1.1, 40)
 
-    out, given = tmp_path / "int8.onnx", (Calibration(images, hashes), LabeledSets(camvid=drawn))
+    out, given = tmp_path / "int8.onnx", (calibration, LabeledSets(camvid=drawn))
     card = quantize(trained[1], out, *given, race=race, max_noise=9.0)
     assert card.precision == "int8"
     assert card.training["quantized"]["calibration"] == "6 images"

@@ -62,6 +62,7 @@ from edgeperc_export.release.to_onnx import (
     export,
     halve,
     load,
+    sets_of,
     terms_of,
     to_graph,
     verify,
@@ -1057,11 +1058,16 @@ def test_weights_that_stayed_elsewhere_and_a_card_that_is_no_text_are_told_of(
 
 
 def test_weights_have_the_terms_of_their_scans() -> None:
-    assert terms_of([]) == ""
-    assert terms_of(["pandaset/002_00", "pandaset/002_01"]).startswith("CC BY 4.0")
-    assert terms_of(["lyft/7", "000001"]) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
-    assert terms_of(["pandaset/002_00", "000001"]).startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
-    assert terms_of(["mine/1"]) == "mine: terms of that set"
+    assert terms_of(sets_of([])) == ""
+    assert terms_of(sets_of(["pandaset/002_00", "pandaset/002_01"])).startswith("CC BY 4.0")
+    assert terms_of(sets_of(["lyft/7", "000001"])) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
+    assert terms_of(sets_of(["pandaset/002_00", "000001"])).startswith(
+        "KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's"
+    )
+    assert terms_of(sets_of(["mine/1"])) == "mine: terms of that set"
+    assert terms_of(sets_of(["0001TP_000001", "yard/1"], camera=True)).endswith(
+        "; images of another set: terms of that set"
+    )
 
 
 @pytest.mark.usefixtures("small_views")

@@ -329,7 +329,7 @@ def test_a_missing_source_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no scans to train objects on"):
         train(RECIPE, tmp_path / "run")
     build_samples(tmp_path, "nothing", [], real=True)
-    nothing = Calibration([np.zeros((0, 4), np.float32)], [])
+    nothing = Calibration([np.zeros((0, 4), np.float32)])
     with pytest.raises(PointsError, match="no candidate in 1 scans"):
         quantize_objects(model_path("objects:fp32"), tmp_path / "int8.onnx", nothing)
     with pytest.raises(ModelError, match="quantize the model in fp32"):
@@ -391,7 +391,7 @@ def test_the_card_of_int8_has_figures_of_its_own(tmp_path: Path, monkeypatch: py
         "object_figures",
         lambda kitti, path, name: ({"of": ModelCard.read(path).precision}, f"{kitti} {name}"),
     )
-    path, calibration = model_path("objects:fp32"), Calibration([simulated_scan(SEED).points], [])
+    path, calibration = model_path("objects:fp32"), Calibration([simulated_scan(SEED).points])
     assert ModelCard.read(path).metrics
     assert quantize_objects(path, tmp_path / "int8.onnx", calibration).metrics == {}
     measured = quantize_objects(path, tmp_path / "int8.onnx", calibration, kitti=Path("KITTI")).metrics

@@ -40,7 +40,7 @@ from edgeperc_export.release.quantize import (
     check_fp32,
     quantize,
 )
-from edgeperc_export.release.to_onnx import to_graph, with_golden, write_card
+from edgeperc_export.release.to_onnx import sets_of, to_graph, with_golden, write_card
 from edgeperc_export.release.triton import write_repository
 
 
@@ -139,7 +139,7 @@ def convolutions(path: Path) -> dict[str, int]:
 def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "small-int8.onnx"
     before = Session(small).card
-    card = quantize(small, out, Calibration(scans, ["f" * 16]), ONE, max_noise=9.0, race=FASTER)
+    card = quantize(small, out, Calibration(scans, {"mine/1": "f" * 16}), ONE, max_noise=9.0, race=FASTER)
     int8, fp32 = onnx.TensorProto.INT8, onnx.TensorProto.FLOAT
     assert convolutions(out) == {"stem": fp32, "down": int8, "context": int8, "merge": int8, "last": fp32}
     nodes = onnx.load(out).graph.node
@@ -153,7 +153,7 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
     assert (card.precision, card.precisions) == ("int8", {})
     assert session.golden_deviation == 0.0
     assert card.golden != before.golden
-    assert card.training["licence"] == "Apache-2.0"
+    assert card.training["licence"] == "Apache-2.0; mine: terms of that set"
     assert set(card.training["frames"].values()) == {"f" * 16, "0123456789abcdef"}
     assert len(card.training["quantized"]["left_alone"]) == 2
     assert card.training["quantized"]["noise"] == pytest.approx(noise_of(small, scans))
@@ -335,19 +335,20 @@ def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarr
             calibration_scans([file])
         with pytest.raises(SplitError, match=f"is of drive .*{drive}"):
             calibration_scans([file.parents[2]], n_simulated=1)
-    found, hashes = calibration_scans([training, nowhere.parent])
+    found, frames = calibration_scans([training, nowhere.parent])
     assert [len(points) for points in found] == [len(scans[0])] * 2
-    assert len(hashes) == 2
+    assert sets_of(frames) == {"KITTI", "scans to calibrate on"}
 
 
 def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> None:
     objects = KittiObjects(kitti_root)
     names = [name for name, drive in objects.drives.items() if not in_split(drive, "train")]
     test = {module.scan_hash(objects.frame(name).points) for name in objects.names("test") if name in names}
-    found, hashes = calibration_scans(kitti=kitti_root)
-    assert 0 < len(found) == len(hashes) <= 64
+    found, frames = calibration_scans(kitti=kitti_root)
+    assert 0 < len(found) == len(frames) <= 64
+    assert sets_of(frames) == {"KITTI"}
     assert test
-    assert not test & set(hashes)
+    assert not test & {*frames.values()}
 
 
 def test_what_is_for_sparse_sensors_is_calibrated_on_their_scans() -> None:

@@ -93,7 +93,7 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
     numbers = cells.number.ravel()
     assert (numbers >= 0).sum() == len(right)
     np.testing.assert_array_equal(numbers[cells.flat], np.arange(len(right)))
-    around: list[set[int]] = []
+    wide: dict[int, list[set[int]]] = {}
     n_found = 0
     for k, per_m in candidates.links_of(distance_per_m):
         scale = candidates.SCALES[k]
@@ -103,13 +103,12 @@ def test_cells_and_groups_agree_with_their_twins(scan: Scan, distance_per_m: flo
         found = [{*cells.flat[order[first[g] : first[g + 1]]].tolist()} for g in range(n)]
         expected = twins.objects.groups(right, scan.ground.height_m, scale, per_m)
         assert found == expected
+        around = wide.get(k, wide.get(0, []))
         for own in expected:
             outer = next((len(other) for other in around if own <= other), None)
             rows = [i for cell in own for i in right[cell]]
-            n_found += twins.objects.is_candidate(
-                scan.points, scan.ground.height_m, rows, scale, len(own), outer if k else None
-            )
-        around = around if k else expected
+            n_found += twins.objects.is_candidate(scan.points, scan.ground.height_m, rows, scale, len(own), outer)
+        wide.setdefault(k, expected)
     assert len(candidates.find_candidates(scan, cells, distance_per_m).rectangles) == n_found
 
 
