@@ -1,4 +1,4 @@
-"""Point cloud messages: ROS 1 and 2 (``sensor_msgs/PointCloud2``) and Foxglove's, from bytes to points."""
+"""Point cloud messages: of ROS 1 and 2 (``sensor_msgs/PointCloud2``), Livox' and Foxglove's, from bytes to points."""
 
 from __future__ import annotations
 
@@ -35,6 +35,15 @@ class PackedField:
     count: int
 
 
+# Of Livox' own messages: the packages that define one, and the fields of a point.
+_LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+_LIVOX_FIELDS = (
+    PackedField("offset_time", 0, 6, 1),
+    *(PackedField(name, 4 * k, 7, 1) for k, name in enumerate("xyz", start=1)),
+    *(PackedField(name, k, 2, 1) for k, name in enumerate(("reflectivity", "tag", "line"), start=16)),
+)
+
+
 class Stamp(NamedTuple):
     """``builtin_interfaces/Time``."""
 
@@ -66,7 +75,12 @@ class MessageReader:
     """Values of a message of ROS, one after another; those of CDR (ROS 2) are aligned to their size."""
 
     def __init__(self, content: memoryview, order: str, *, aligned: bool) -> None:
-        self._content, self._order, self._aligned, self._at = content, order, aligned, 0
+        self._content, self._order, self.aligned, self._at = content, order, aligned, 0
+
+    @property
+    def is_bigendian(self) -> bool:
+        """Whether the first byte of a number is the largest."""
+        return self._order == ">"
 
     @property
     def left(self) -> int:
@@ -76,7 +90,7 @@ class MessageReader:
     def value(self, code: str) -> int:
         """A number, by its code in `struct`."""
         size = struct.calcsize(code)
-        if self._aligned:
+        if self.aligned:
             self._at += -self._at % size
         (value,) = struct.unpack(self._order + code, self.take(size))
         return int(value)
@@ -95,11 +109,11 @@ class MessageReader:
 
     def stamp(self) -> Stamp:
         """A ``time``."""
-        return Stamp(self.value("i" if self._aligned else "I"), self.value("I"))
+        return Stamp(self.value("i" if self.aligned else "I"), self.value("I"))
 
     def header(self) -> Header:
         """A ``std_msgs/Header``."""
-        if not self._aligned:
+        if not self.aligned:
             self.value("I")  # ROS 1 counts messages
         return Header(self.stamp(), self.text())
 
@@ -125,6 +139,16 @@ def _ros_cloud(read: MessageReader) -> Cloud:
     is_bigendian, point_step, row_step = bool(read.value("B")), read.value("I"), read.value("I")
     data = read.take(read.value("I"))
     return Cloud(header, height, width, fields, is_bigendian, point_step, row_step, data)
+
+
+def _livox_cloud(read: MessageReader) -> Cloud:
+    """``CustomMsg`` of Livox' drivers, as a cloud: points of 19 bytes, in CDR at every fourth byte."""
+    header = read.header()
+    read.value("Q")  # the time of the first point, as in the header
+    read.take(8)  # the number of points, as below; which LiDAR
+    n, step = read.value("I"), 20 if read.aligned else 19
+    data = bytes(read.take(max(n * step - step + 19, 0))).ljust(n * step, b"\0")
+    return Cloud(header, 1, n, _LIVOX_FIELDS, read.is_bigendian, step, n * step, memoryview(data))
 
 
 def _protobuf(content: memoryview) -> Iterator[tuple[int, Any]]:
@@ -185,6 +209,14 @@ CLOUD_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Cloud]] 
         ("sensor_msgs/msg/PointCloud2", "cdr"): lambda content: _ros_cloud(cdr_reader(content)),
         ("sensor_msgs/PointCloud2", "ros1"): lambda content: _ros_cloud(ros1_reader(content)),
         ("foxglove.PointCloud", "protobuf"): _foxglove_cloud,
+        **{
+            (f"{package}/msg/CustomMsg", "cdr"): lambda content: _livox_cloud(cdr_reader(content))
+            for package in _LIVOX_PACKAGES
+        },
+        **{
+            (f"{package}/CustomMsg", "ros1"): lambda content: _livox_cloud(ros1_reader(content))
+            for package in _LIVOX_PACKAGES
+        },
     }
 )
 """What reads a point cloud of a type in an encoding."""

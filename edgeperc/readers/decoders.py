@@ -21,6 +21,9 @@ from .mcap import BagFile, Channel
 from .ouster import check_osf
 from .packet_messages import (
     PACKET_READERS,
+    ROBOSENSE,
+    LidarMessages,
+    LidarPackets,
     OusterMessages,
     OusterPacket,
     Packets,
@@ -28,8 +31,10 @@ from .packet_messages import (
     VelodyneStream,
     has_points,
     is_metadata_of,
+    is_of_unit,
     packets_of_others,
     read_text,
+    unit_in,
 )
 from .packets import (
     SNIFFED_PACKETS,
@@ -44,6 +49,7 @@ from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
+_DESCRIBED = 200  # packets that show how far apart the columns of a turn are
 _FEWEST_ALIKE = 16  # packets of another Ouster; damaged ones are each unlike
 _READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | Packets]] = {**CLOUD_READERS, **PACKET_READERS}
 
@@ -83,7 +89,8 @@ class _Job(NamedTuple):
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
-    Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; or ``topic``, ``frame``,
+    Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; ``spinning``, the format of
+        Hesai's or RoboSense's packets, ``lasers_deg`` and ``columns``; or ``topic``, ``frame``,
         ``fields`` and ``elevations_deg`` of a point cloud: the median elevation of each ring or, without rings, of each
         row of an organized cloud [deg], None where a ring has no return; empty without both.
     """
@@ -93,14 +100,23 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             frames, chosen = _open_osf(path, topic)
             yield {"metadata": frames.sensor_info[chosen].to_json_string()}
         else:
+            payloads, unit = list[memoryview](), None
             for name, message, _ in _clouds(path, topic, alive):
                 if isinstance(message, VelodyneScan):
                     names = {velodyne_name(packet) for _, packet in message.packets}
                     yield {"velodyne": sorted(names, key=str)}
+                elif isinstance(message, LidarPackets):
+                    payloads, unit = [*payloads, *(packet for _, packet in message.packets)], message.unit
+                    if len(payloads) >= _DESCRIBED:
+                        break
                 elif isinstance(message, OusterPacket):
                     yield {"metadata": message.metadata}
                 else:
                     yield describe_cloud(name, message)
+            if payloads:
+                from .lidars import describe_packets  # numba
+
+                yield describe_packets(path, payloads, unit)
 
     return next(_with_typed_errors(path, found()))
 
@@ -307,7 +323,7 @@ def _osf_scans(job: _Job) -> Iterator[TimedScan]:
 
 
 def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
-    turns: VelodyneStream | OusterMessages | None = None
+    turns: VelodyneStream | OusterMessages | LidarMessages | None = None
     try:
         for _, message, stamp_s in _clouds(job.path, job.topic, job.alive):
             if isinstance(message, VelodyneScan):
@@ -318,6 +334,11 @@ def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
             if isinstance(message, OusterPacket):
                 if not isinstance(turns, OusterMessages):
                     turns = OusterMessages(message.metadata, job.remission_field)
+                yield from turns.add(message, stamp_s)
+                continue
+            if isinstance(message, LidarPackets):
+                _check_unnamed(job.remission_field)
+                turns = turns if isinstance(turns, LidarMessages) else LidarMessages(job.path, message.unit)
                 yield from turns.add(message, stamp_s)
                 continue
             try:
@@ -362,6 +383,7 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, name or None, more)]
         n_scans, frames = 0, dict[str, None]()
         metadata: str | None = None
+        unit: tuple[memoryview | None] | None = None
         for message, recorded_ns in _messages(files, clouds, chosen, damage):
             frames.setdefault(message.header.frame_id)
             if frame and message.header.frame_id != frame:
@@ -376,6 +398,10 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
             if isinstance(message, OusterPacket):
                 metadata = _ouster_metadata(files, topics, chosen) if metadata is None else metadata
                 message = message._replace(metadata=metadata)
+            elif isinstance(message, LidarPackets):
+                if unit is None and any(bytes(packet[:4]) in ROBOSENSE for _, packet in message.packets):
+                    unit = (_unit(files, topics, chosen),)
+                message = message._replace(unit=unit and unit[0])
             stamp = message.header.stamp
             stamp_s, stamp_ns = stamp.sec + 1e-9 * stamp.nanosec, 10**9 * stamp.sec + stamp.nanosec
             yield chosen, message, Stamp(stamp_s, stamp_ns) if stamp_ns else Stamp(1e-9 * recorded_ns, recorded_ns)
@@ -395,6 +421,18 @@ def _ouster_metadata(files: Sequence[BagFile], topics: Set[Channel], topic: str)
         f"topic {topic.rpartition('/')[0]}/metadata. Play the bag through Ouster's driver (ouster-ros) with its "
         "metadata, and record its sensor_msgs/PointCloud2"
     )
+
+
+def _unit(files: Sequence[BagFile], topics: Set[Channel], topic: str) -> memoryview | None:
+    """What a RoboSense says of itself: in its topic, in one whose name begins so, or any of a bag with one sensor."""
+    n_sensors = len({channel.topic for channel in topics if has_points(channel)})
+    for channel in sorted(topics, key=lambda channel: (channel.topic != topic, channel)):
+        if channel.topic.startswith(topic) or (is_of_unit(channel) and n_sensors == 1):
+            for file in files:
+                for _, raw in file.messages_of(channel) if channel in file.topics() else ():
+                    if (unit := unit_in(raw)) is not None:
+                        return memoryview(bytes(unit))
+    return None
 
 
 def _messages(

@@ -98,19 +98,23 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
         return None
     if lidar.row is None:
         raise of_livox()
-    from .lidars import columns_of, open_spinning  # numba
+    from .lidars import columns_of, open_spinning, payloads_of  # numba
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
-    row, angles = open_spinning(path, lidar.row, sender, lambda: None)
-    elevations = _distinct(angles.lasers_deg[:, 0].tolist())
+    row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None))
+    return of_spinning(row.name, angles.lasers_deg.tolist(), columns_of(row, payloads_of(path, sender, lambda: None)))
+
+
+def of_spinning(name: str, lasers_deg: Sequence[Sequence[float]], columns: int) -> KnownSensor:
+    """The sensor of Hesai's or RoboSense's packets, by the name of their format and the angles of the unit."""
+    from .spinning_packets import FORMATS  # numba
+
+    title, elevations = FORMATS[name].title, _distinct([elevation for elevation, _ in lasers_deg])
     if not elevations:
-        raise SensorError(
-            f"the packets are of a {row.title}, whose lasers have several times the same angle. {_CHOICES}"
-        )
-    profile = SENSORS.get(row.name, SensorProfile(row.name, elevations, 1800, (0.0, 255.0)))
-    columns = columns_of(path, row, sender) or profile.columns
-    because = f"the packets are a {row.title}'s, with the angles of the unit"
-    return KnownSensor(replace(profile, elevations_deg=elevations, columns=columns), because)
+        raise SensorError(f"the packets are of a {title}, whose lasers have several times the same angle. {_CHOICES}")
+    profile = SENSORS.get(name, SensorProfile(name, elevations, 1800, (0.0, 255.0)))
+    because = f"the packets are a {title}'s, with the angles of the unit"
+    return KnownSensor(replace(profile, elevations_deg=elevations, columns=columns or profile.columns), because)
 
 
 def of_velodyne(names: Collection[str | None]) -> KnownSensor:

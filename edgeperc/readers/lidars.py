@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
 from .packets import Datagrams
-from .senders import Lidar
+from .senders import Lidar, not_decoded
 from .spinning_packets import (
     FORMATS,
     Angles,
@@ -21,6 +22,7 @@ from .spinning_packets import (
     angles_of_difop,
     format_of,
     has_16_lasers,
+    name_of,
     read_angles,
 )
 from .times import TimedScan
@@ -29,19 +31,19 @@ _STEPS = 200  # packets that show how far apart columns are
 _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
 
 
-def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> tuple[Format, Angles]:
-    """The format and angles of a spinning sensor; PointsError if neither the capture nor a file beside it has them."""
+def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tuple[Format, Angles]:
+    """The format and angles of a spinning sensor; PointsError if neither its packets nor a file beside the capture has
+    them.
+    """
     files = sorted(path.absolute().parent.glob("*.csv"))
     # Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture.
     own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
     file = min(own, key=lambda each: len(each.stem), default=None)
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
-    for datagram in () if row.is_hesai else Datagrams(path, alive):
-        if not datagram.is_from(sender):
-            continue
-        if row.name == "helios-32" and angles_of_difop(FORMATS["helios-16"], datagram.payload) is not None:
-            row = FORMATS["helios-16"] if has_16_lasers(datagram.payload) else row
-        said = angles_of_difop(row, datagram.payload)
+    for payload in () if row.is_hesai else payloads:
+        if row.name == "helios-32" and angles_of_difop(FORMATS["helios-16"], payload) is not None:
+            row = FORMATS["helios-16"] if has_16_lasers(payload) else row
+        said = angles_of_difop(row, payload)
         if said is not None:
             break
     if file is not None and (said is None or row.elevations_deg):
@@ -56,10 +58,10 @@ def open_spinning(path: Path, row: Format, sender: str | None, alive: Callable[[
     return row, said
 
 
-def columns_of(path: Path, row: Format, sender: str | None) -> int:
+def columns_of(row: Format, payloads: Iterable[memoryview]) -> int:
     """How many columns a turn has, by the azimuths of the first packets; 0 if they do not show it."""
     stream, azimuths = SpinningStream(row, Angles(np.zeros((128, 2)))), list[float]()
-    for payload in islice(_of_format(path, row, sender, lambda: None), _STEPS):
+    for payload in islice((each for each in payloads if is_of(row, each)), _STEPS):
         azimuths += stream.azimuths_of(payload)
     steps = np.diff(azimuths) % 360.0
     steps = steps[(steps > 0.01) & (steps < 5.0)]
@@ -67,16 +69,37 @@ def columns_of(path: Path, row: Format, sender: str | None) -> int:
     return round(firings * 360.0 / float(np.median(steps))) if len(steps) else 0
 
 
-def _of_format(path: Path, row: Format, sender: str | None, alive: Callable[[], None]) -> Iterator[memoryview]:
-    """The packets of a sensor, all of one size."""
-    size = 0
-    for datagram in Datagrams(path, alive):
-        found = format_of(datagram.payload)
-        if found is None or (found != row and {found.name, row.name} != _ALIKE) or not datagram.is_from(sender):
-            continue
-        size = size or len(datagram.payload)
-        if len(datagram.payload) == size:
-            yield datagram.payload
+def payloads_of(path: Path, sender: str | None, alive: Callable[[], None]) -> Iterator[memoryview]:
+    """What the packets of a sender carry, None: of all."""
+    return (datagram.payload for datagram in Datagrams(path, alive) if datagram.is_from(sender))
+
+
+def format_in(payloads: Iterable[memoryview]) -> Format | None:
+    """The format of the first packet with points; None if there is none.
+
+    Raises PointsError: The first one is of a sensor whose packets are not decoded.
+    """
+    for payload in payloads:
+        if (row := format_of(payload)) is not None:
+            return row
+        if (name := name_of(payload)) is not None:
+            raise PointsError(not_decoded(name))
+    return None
+
+
+def is_of(row: Format, payload: memoryview) -> bool:
+    """Whether it is a packet of this format."""
+    found = format_of(payload)
+    return found is not None and (found == row or {found.name, row.name} == _ALIKE)
+
+
+def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryview | None) -> dict[str, Any]:
+    """What packets in messages say about their sensor; see `decoders.describe`."""
+    row = format_in(payloads)
+    if row is None:
+        raise PointsError("the packets hold no points of a sensor that is known")
+    row, angles = open_spinning(path, row, [] if unit is None else [unit])
+    return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": columns_of(row, payloads)}
 
 
 def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None]) -> Iterator[TimedScan]:
@@ -87,10 +110,11 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     """
     first = sender or lidar.first
     if lidar.row is not None:
-        row, angles = open_spinning(path, lidar.row, sender, alive)
+        row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, alive))
         stream = SpinningStream(row, angles)
-        for payload in _of_format(path, row, first, alive):
-            yield from stream.add(payload)
+        for payload in payloads_of(path, first, alive):
+            if is_of(row, payload):
+                yield from stream.add(payload)
         yield from stream.end()
     else:
         livox = LivoxStream()

@@ -1,10 +1,13 @@
-"""Messages of drivers that hold a LiDAR's packets: Velodyne's and Ouster's, which are decoded; others are named."""
+"""Messages of drivers that hold a LiDAR's packets: of Velodyne, Ouster, Hesai and RoboSense; others are named."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -13,9 +16,9 @@ import numpy as np
 from ..errors import PointsError
 from ..system.extras import require
 from ..types.points import as_points
-from .clouds import Header, MessageReader, Stamp, cdr_reader, ros1_reader
+from .clouds import CLOUD_READERS, Header, MessageReader, Stamp, cdr_reader, ros1_reader
 from .mcap import Channel
-from .packets import VELODYNE_BYTES, velodyne_name
+from .packets import DIFOP, VELODYNE_BYTES, velodyne_name
 from .times import TimedScan
 
 
@@ -34,7 +37,50 @@ class OusterPacket(NamedTuple):
     metadata: str = ""
 
 
-Packets = VelodyneScan | OusterPacket
+class LidarPackets(NamedTuple):
+    """Packets of Hesai's or RoboSense's: when each came [ns], 0: not said, and its bytes."""
+
+    header: Header
+    packets: tuple[tuple[int, memoryview], ...]
+    unit: memoryview | None = None  # what a RoboSense says of itself (DIFOP), of any message
+
+
+Packets = VelodyneScan | OusterPacket | LidarPackets
+
+
+class _Layout(NamedTuple):
+    """A message with packets."""
+
+    has_header: bool = True
+    has_many: bool = True  # a list of packets
+    flags: int = 0  # bytes in front of a packet
+    has_stamps: bool = True
+    n_bytes: int = 0  # of a packet; 0: each says it
+    says_size: bool = False  # behind a packet, how many of its bytes it has
+
+
+# By the type of the message; drivers of other versions write some otherwise: the first is taken that fits.
+_LAYOUTS = {
+    "pandar_msgs/PandarScan": (_Layout(n_bytes=1500, says_size=True),),
+    "hesai_lidar/PandarScan": (_Layout(says_size=True), _Layout(n_bytes=1500, says_size=True)),
+    "hesai_ros_driver/UdpFrame": tuple(
+        _Layout(has_header=header, has_stamps=stamps, says_size=True)
+        for header in (True, False)
+        for stamps in (True, False)
+    ),
+    "nebula_msgs/NebulaPackets": (_Layout(),),
+    "rslidar_msg/RslidarPacket": (
+        _Layout(has_many=False, flags=2, has_stamps=False),
+        _Layout(has_header=False, has_many=False, n_bytes=1248),
+    ),
+    "rslidar_msg/RslidarScan": (_Layout(n_bytes=1248),),
+    "rslidar_msgs/rslidarScan": (_Layout(n_bytes=1248),),
+    "robosense_msgs/RobosenseScan": (_Layout(n_bytes=1248, says_size=True),),
+}
+# What a RoboSense says of itself, in a topic of its own.
+ROBOSENSE = (DIFOP[:4], b"\x55\xaa\x05\x0a", b"\x55\xaa\x05\x5a")
+"""The first bytes of RoboSense's packets."""
+_OF_UNITS = {"rslidar_msgs/rslidarPacket", "rslidar_msg/RslidarPacket", "robosense_msgs/RobosenseInfoPacket"}
 
 
 def _ouster_packet(read: MessageReader) -> OusterPacket:
@@ -52,6 +98,30 @@ def _velodyne_scan(read: MessageReader) -> VelodyneScan:
     return VelodyneScan(header, tuple(packets))
 
 
+def _lidar_packets(content: memoryview, start: Callable[[memoryview], MessageReader], name: str) -> Packets:
+    for layout in _LAYOUTS[name]:
+        with suppress(PointsError):
+            read = start(content)
+            message = _by_layout(read, layout)
+            if read.left < 4:
+                return message
+    raise PointsError(f"a message is damaged: its {len(content):,} bytes are not of a {name}")
+
+
+def _by_layout(read: MessageReader, layout: _Layout) -> Packets:
+    header = read.header() if layout.has_header else Header(Stamp(0, 0), "")
+    packets = []
+    for _ in range(read.value("I") if layout.has_many else 1):
+        read.take(layout.flags)
+        stamp = read.stamp() if layout.has_stamps else Stamp(0, 0)
+        content = read.take(layout.n_bytes or read.value("I"))
+        size = read.value("I") if layout.says_size else len(content)
+        packets.append((10**9 * stamp.sec + stamp.nanosec, content[:size]))
+    if all(len(packet) == VELODYNE_BYTES for _, packet in packets) and packets:
+        return VelodyneScan(header, tuple(packets))
+    return LidarPackets(header, tuple(packets))
+
+
 PACKET_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Packets]] = MappingProxyType(
     {
         ("ouster_sensor_msgs/msg/PacketMsg", "cdr"): lambda content: _ouster_packet(cdr_reader(content)),
@@ -59,6 +129,11 @@ PACKET_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Packets
         ("ouster_ros/PacketMsg", "ros1"): lambda content: _ouster_packet(ros1_reader(content)),
         ("velodyne_msgs/msg/VelodyneScan", "cdr"): lambda content: _velodyne_scan(cdr_reader(content)),
         ("velodyne_msgs/VelodyneScan", "ros1"): lambda content: _velodyne_scan(ros1_reader(content)),
+        **{
+            (name.replace("/", "/msg/"), "cdr"): partial(_lidar_packets, start=cdr_reader, name=name)
+            for name in _LAYOUTS
+        },
+        **{(name, "ros1"): partial(_lidar_packets, start=ros1_reader, name=name) for name in _LAYOUTS},
     }
 )
 """What reads a message of packets of a type in an encoding."""
@@ -75,7 +150,7 @@ _OTHERS = (
 def packets_of_others(channels: Iterable[Channel]) -> list[str]:
     """For each topic with such messages a sentence: whose they are, and what makes point clouds of them."""
     said = []
-    for channel in sorted(channels):
+    for channel in sorted(channel for channel in channels if channel[1:] not in {**CLOUD_READERS, **PACKET_READERS}):
         for pattern, what, driver in _OTHERS:
             if re.match(pattern, channel.msgtype):
                 said.append(
@@ -86,9 +161,23 @@ def packets_of_others(channels: Iterable[Channel]) -> list[str]:
 
 
 def has_points(channel: Channel) -> bool:
-    """Whether messages hold packets with points: an Ouster's with motion have the same type, and imu in their topic."""
-    is_decoded = channel[1:] in PACKET_READERS
-    return is_decoded and not (channel.msgtype.endswith("PacketMsg") and "imu" in channel.topic.rpartition("/")[2])
+    """Whether messages hold packets with points: an Ouster's with motion, and what a RoboSense says of itself, may have
+    the same type, and imu or difop in their topic.
+    """
+    name = channel.topic.rpartition("/")[2]
+    is_other = (channel.msgtype.endswith("PacketMsg") and "imu" in name) or (is_of_unit(channel) and "difop" in name)
+    return channel[1:] in PACKET_READERS and not is_other
+
+
+def is_of_unit(channel: Channel) -> bool:
+    """Whether messages may be what a RoboSense says of itself."""
+    return channel.msgtype.replace("/msg/", "/") in _OF_UNITS
+
+
+def unit_in(content: memoryview) -> memoryview | None:
+    """The packet in a message with what a RoboSense says of itself (DIFOP), 1248 bytes; None if there is none."""
+    at = bytes(content).find(DIFOP)
+    return content[at : at + 1248] if 0 <= at <= len(content) - 1248 else None
 
 
 def is_metadata_of(channel: Channel, topic: str) -> bool:
@@ -102,8 +191,25 @@ def read_text(channel: Channel, content: memoryview) -> str:
     return (cdr_reader(content) if channel.encoding == "cdr" else ros1_reader(content)).text()
 
 
-class OusterMessages:
-    """Turns of an Ouster from messages, on the clock of the computer that recorded the bag."""
+class _Turns:
+    """Turns from messages with packets, on the clock of the computer that recorded the bag."""
+
+    _stream: Any = None
+    _last_s = 0.0
+
+    def end(self) -> Iterator[TimedScan]:
+        """The last turn, which may be a part."""
+        if self._stream is not None:
+            yield from map(self._of_computer, self._stream.end())
+
+    def _of_computer(self, scan: TimedScan) -> TimedScan:
+        assert scan.times_s is not None
+        assert scan.stamp_s is not None
+        return TimedScan(self._last_s, scan.points, scan.times_s - scan.stamp_s + self._last_s)
+
+
+class OusterMessages(_Turns):
+    """Turns of an Ouster."""
 
     def __init__(self, metadata: str, remission_field: str | None) -> None:
         from .ouster_packets import OusterStream, layout_of  # numba, which other messages do without
@@ -112,7 +218,7 @@ class OusterMessages:
             self._layout = layout_of(json.loads(metadata))
         except (ValueError, RecursionError) as exc:
             raise PointsError(f"the Ouster's metadata in the bag cannot be read: {exc}") from exc
-        self._stream, self._last_s = OusterStream(self._layout, remission_field), 0.0
+        self._stream = OusterStream(self._layout, remission_field)
 
     def add(self, message: OusterPacket, stamp_s: float) -> Iterator[TimedScan]:
         """The turns that end in a message."""
@@ -120,14 +226,25 @@ class OusterMessages:
         if len(message.content) == self._layout.packet_bytes and self._stream.is_of_sensor(message.content):
             yield from map(self._of_computer, self._stream.add(bytes(message.content)))
 
-    def end(self) -> Iterator[TimedScan]:
-        """The last turn, which may be a part."""
-        yield from map(self._of_computer, self._stream.end())
 
-    def _of_computer(self, scan: TimedScan) -> TimedScan:
-        assert scan.times_s is not None
-        assert scan.stamp_s is not None
-        return TimedScan(self._last_s, scan.points, scan.times_s - scan.stamp_s + self._last_s)
+class LidarMessages(_Turns):
+    """Turns of a Hesai or RoboSense, by the angles that a file beside the bag has, or a packet of the unit."""
+
+    def __init__(self, path: Path, unit: memoryview | None) -> None:
+        self._path, self._units = path, [] if unit is None else [unit]
+
+    def add(self, message: LidarPackets, stamp_s: float) -> Iterator[TimedScan]:
+        """The turns that end in a message. Raises PointsError: The angles are not known, or the packets not decoded."""
+        from .lidars import format_in, is_of, open_spinning  # numba
+        from .spinning_packets import SpinningStream
+
+        for stamp_ns, packet in message.packets:
+            if self._stream is None and (row := format_in([packet])) is not None:
+                self._row, angles = open_spinning(self._path, row, self._units)
+                self._stream = SpinningStream(self._row, angles)
+            if self._stream is not None and is_of(self._row, packet):
+                yield from map(self._of_computer, self._stream.add(packet))
+                self._last_s = 1e-9 * stamp_ns if stamp_ns else stamp_s
 
 
 class VelodyneStream:

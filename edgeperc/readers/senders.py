@@ -116,10 +116,15 @@ class Senders:
             return Lidar(self._rows.get(kind), names, f"{address}:{port}")
         if any(other in (_VELODYNE, _OUSTER) for other, _ in self._counts):
             return None
-        raise PointsError(
-            f"a capture of a {kind}, which cannot be decoded; the documentation lists those that are. Convert it with "
-            f"{kind.split()[0]}'s driver, to a ROS bag or to .pcd files"
-        )
+        raise PointsError(not_decoded(kind))
+
+
+def not_decoded(name: str) -> str:
+    """What to say of a capture of a sensor that is known by its packets alone."""
+    return (
+        f"a capture of a {name}, which cannot be decoded; the documentation lists those that are. Convert it with "
+        f"{name.split()[0]}'s driver, to sensor_msgs/PointCloud2 in a ROS bag or to .pcd files"
+    )
 
 
 @cache

@@ -327,10 +327,15 @@ class SpinningStream:
         self._row, self._angles = row, angles
         self._order: Literal["<", ">"] = "<" if row.is_hesai else ">"
         self._packets: list[_Packet] = []
-        self._last_deg = np.nan
+        self._last_deg, self._size = np.nan, 0
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
-        """The turns that end in a packet of the format: where the azimuth begins anew."""
+        """The turns that end in a packet of the format: where the azimuth begins anew. All have the size of the first;
+        others are left out.
+        """
+        self._size = self._size or len(payload)
+        if len(payload) != self._size:
+            return
         packet = self._packet(payload)
         begin = 0
         for k, azimuth in enumerate(packet.azimuths.tolist()):

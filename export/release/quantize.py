@@ -150,14 +150,14 @@ def calibration_scans(
         frames[name] = number
     if kitti is not None:
         objects = KittiObjects(kitti)
-        for name in _few(objects.names("train", grades="AB")):
-            scans.append(objects.frame(name).points)
-            frames[name] = scan_hash(scans[-1])
+        for frame in map(objects.frame, _few(objects.names("train", grades="AB"))):
+            scans.append(frame.points)
+            frames[frame.name] = scan_hash(frame.points)
     for folder in sets:
         check_trains(folder, "train")
         of_set, _, own = read_scan_set(folder, "train")
         scans += _few(of_set)
-        frames |= _few([*own.items()])
+        frames |= dict(_few([*own.items()]))
     scans += [simulated_scan(FIRST_SEED + k).points for k in range(n_simulated)]
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
@@ -176,7 +176,7 @@ def _scans_in(folder: Path) -> list[Path]:
     return files
 
 
-def _few(each: list[T], most: int = 64) -> list[T]:
+def _few(each: Sequence[T], most: int = 64) -> Sequence[T]:
     """At most so many, evenly spread."""
     return each[:: max(1, len(each) // most)][:most]
 

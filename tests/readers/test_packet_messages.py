@@ -1,4 +1,4 @@
-"""Bags of drivers that recorded packets: a Velodyne's are decoded as from a capture, others are named."""
+"""Bags of drivers that recorded packets: decoded as from a capture; those that are not are named."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 from capture_writers import check_same, mcap_channel, mcap_message, sized, vlp16_packets, write_pcap, write_records
 from hypothesis import given
 from hypothesis import strategies as st
+from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
 from test_captures import LIDAR, messages
 from test_identify import velodyne
 from test_ouster_packets import METADATA, random_packets
@@ -21,7 +22,8 @@ from test_ouster_packets import record as write_capture
 
 from cli_helpers import Shell
 from edgeperc import PointsError, SensorError, read_scans, read_timed_scans, sensor_of
-from edgeperc.readers.packet_messages import PACKET_READERS, VelodyneScan
+from edgeperc.readers.clouds import CLOUD_READERS
+from edgeperc.readers.packet_messages import PACKET_READERS, LidarPackets, OusterPacket, VelodyneScan
 from edgeperc.types.sensor import SENSORS
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -178,15 +180,187 @@ def test_clouds_come_first_and_a_topic_chooses(tmp_path: Path) -> None:
     assert sum(len(points) for _, points in read_scans(two, topic="/right")) == 75 * 12 * 32
 
 
+HEADER, MANY = "std_msgs/Header header\n", "{package}/{packet}[] packets\n"
+# Type of the message, of its packets, their fields, and whose they are; the drivers' definitions.
+LIDARS = {
+    "pandar_msgs": ("PandarScan", "PandarPacket", "{time} stamp\nuint8[1500] data\nuint32 size\n", "pandarxt-32"),
+    "hesai_lidar": ("PandarScan", "PandarPacket", "{time} stamp\nuint8[] data\nuint32 size\n", "pandar40p"),
+    "hesai_ros_driver": ("UdpFrame", "UdpPacket", "{time} stamp\nuint8[] data\nuint32 size\n", "pandarxt-16"),
+    "hesai_ros_driver, short": ("UdpFrame", "UdpPacket", "uint8[] data\nuint32 size\n", "ot128"),
+    "nebula_msgs": ("NebulaPackets", "NebulaPacket", "{time} stamp\nuint8[] data\n", "pandarqt-64"),
+    "rslidar_msg": ("RslidarPacket", "", "uint8 is_difop\nuint8 is_frame_begin\nuint8[] data\n", "helios-32"),
+    "rslidar_msg, older": ("RslidarScan", "RslidarPacket", "{time} stamp\nuint8[1248] data\n", "rs-airy"),
+    "rslidar_msgs": ("rslidarScan", "rslidarPacket", "{time} stamp\nuint8[1248] data\n", "rs-16"),
+    "robosense_msgs": ("RobosenseScan", "RobosensePacket", "{time} stamp\nuint8[1248] data\nuint32 size\n", "rs-32"),
+}
+
+
+class Driver:
+    """Messages of a driver, serialized by rosbags from their definitions."""
+
+    def __init__(self, name: str, version: int) -> None:
+        typesys = pytest.importorskip("rosbags.typesys")
+        kind, packet, fields, self.model = LIDARS[name]
+        package = name.partition(",")[0]
+        self.version, self.packet, self.has_header = version, f"{package}/msg/{packet}", "short" not in name
+        self.kind = f"{package}/msg/{kind}"
+        self.store = typesys.get_typestore(typesys.Stores["ROS1_NOETIC" if version == 1 else "ROS2_HUMBLE"])
+        fields = fields.format(time="time" if version == 1 else "builtin_interfaces/Time")
+        body = MANY.format(package=package, packet=packet) if packet else fields
+        if packet:
+            self.store.register(typesys.get_types_from_msg(fields, self.packet))
+        self.store.register(typesys.get_types_from_msg((HEADER if self.has_header else "") + body, self.kind))
+        self.fixed = next((n for n in (1500, 1248) if f"[{n}]" in fields), 0)
+
+    def type_of(self, kind: str) -> str:
+        return kind if self.version == 2 else kind.replace("/msg/", "/")
+
+    def write(self, kind: str, message: Any) -> bytes:
+        written = (self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr)(message, kind)
+        return bytes(written)
+
+    def message(self, packets: Sequence[bytes], first: int) -> bytes:
+        """Of packets that came every millisecond."""
+        types = self.store.types
+
+        def stamp(k: int) -> Any:
+            return types["builtin_interfaces/msg/Time"](sec=1000, nanosec=10**6 * k)
+
+        counter = {"seq": 7} if self.version == 1 else {}
+        header = types["std_msgs/msg/Header"](stamp=stamp(first), frame_id="lidar", **counter)
+        headers = {"header": header} if self.has_header else {}
+        if not self.packet.rpartition("/")[2]:
+            is_difop = packets[0][:1] == b"\xa5"
+            data = np.frombuffer(packets[0], np.uint8)
+            return self.write(self.kind, types[self.kind](is_difop=is_difop, is_frame_begin=0, data=data, **headers))
+        made = []
+        for k, packet in enumerate(packets, start=first):
+            data = np.frombuffer(packet.ljust(self.fixed, b"\0"), np.uint8)
+            values = {"stamp": stamp(k), "data": data, "size": len(packet)}
+            kind = types[self.packet]
+            made.append(kind(**{name: values[name] for name in kind.__dataclass_fields__ if name in values}))
+        return self.write(self.kind, types[self.kind](packets=made, **headers))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", LIDARS)
+def test_packets_of_other_drivers_give_the_turns_of_a_capture(tmp_path: Path, name: str, version: int) -> None:
+    """With the angles of the unit: of a file beside the bag, or in packets of the topic, or in a topic of their own."""
+    driver = Driver(name, version)
+    model = MODELS[driver.model]
+    firings = 2 if model.second == "firing" else 1
+    blocks = blocks_of(model, *ranges(model, round(2.5 * 360 / model.step_deg) * firings))
+    packets, angles = packets_of(model, blocks), unit_angles(model)
+    says = [difop(model, angles)] if model.layout == ">" else []
+    if not says and not model.name.startswith("pandarxt"):
+        (tmp_path / "a.csv").write_text(calibration(angles))
+    of_capture = [*read_timed_scans(write_pcap(tmp_path / "a.pcap", says + packets))]
+    encoding, write = ("ros1", ros1_bag) if version == 1 else ("cdr", mcap_of)
+    size, own = (1, says) if not driver.packet.rpartition("/")[2] else (37, [])
+    topics = [(PACKETS, driver.type_of(driver.kind), encoding, split(own + packets, size, driver.message))]
+    if says and not own:
+        kind = driver.packet if "robosense" not in name else "robosense_msgs/msg/RobosenseInfoPacket"
+        head = b"" if version == 1 else b"\0\1\0\0"
+        topics.append((f"{PACKETS}_difop", driver.type_of(kind), encoding, [head + bytes(8) + says[0]]))
+    path = write(tmp_path / ("a.bag" if version == 1 else "a.mcap"), topics, 10**6 * size)
+    of_bag = [*read_timed_scans(path)]
+    assert check_same(of_bag, of_capture, clock=False) == 3
+    for one, other in zip(of_bag, of_capture, strict=True):
+        assert 1000.0 <= one.stamp_s < 1010.0
+        np.testing.assert_allclose(one.times_s - one.stamp_s, other.times_s - other.stamp_s, atol=1e-6)
+    sensor = sensor_of(path)
+    assert sensor == sensor_of(tmp_path / "a.pcap")
+    if says:
+        bare = write(tmp_path / "bare", topics[:1] if not own else [(*topics[0][:3], topics[0][3][1:])], 10**6)
+        with pytest.raises(PointsError, match=r"angles of the lasers of this RoboSense .* are not known.*bare\.csv"):
+            next(iter(read_scans(bare)))
+
+
+@pytest.mark.parametrize("name", LIDARS)
+@given(data=st.data())
+def test_damaged_messages_of_other_drivers(name: str, data: st.DataObject) -> None:
+    driver = Driver(name, 2)
+    model = MODELS[driver.model]
+    packets = packets_of(model, blocks_of(model, *ranges(model, 4 * model.blocks)))[:2]
+    content = bytearray(driver.message(packets[: 1 if not driver.packet.rpartition("/")[2] else 2], 0))
+    read = PACKET_READERS[driver.kind, "cdr"]
+    whole = read(memoryview(bytes(content)))
+    assert isinstance(whole, LidarPackets)
+    assert [bytes(packet) for _, packet in whole.packets] == packets[: len(whole.packets)]
+    for at in data.draw(st.lists(st.integers(0, 60), max_size=4)):
+        content[at] = data.draw(st.integers(0, 255))
+    with suppress(PointsError):
+        found = read(memoryview(bytes(content[: data.draw(st.integers(0, len(content)))])))
+        assert sum(len(packet) for _, packet in found.packets) <= len(content)  # type: ignore[union-attr]
+
+
+def test_a_velodynes_packets_of_nebula_are_a_velodynes(tmp_path: Path) -> None:
+    packets = vlp16_packets(1.2)
+    driver = Driver("nebula_msgs", 2)
+    path = mcap_of(tmp_path / "a.mcap", [(PACKETS, driver.kind, "cdr", split(packets, 75, driver.message))])
+    assert sum(len(points) for _, points in read_scans(path)) == len(packets) * 12 * 32
+    assert sensor_of(path) is SENSORS["vlp-16"]
+
+
+def test_a_sensor_that_is_not_decoded_is_named(tmp_path: Path) -> None:
+    packet = bytes((0xEE, 0xFF, 4, 3, 0, 0, 128, 2, 0, 4, 1, 0)).ljust(1118, b"\0")
+    driver = Driver("hesai_ros_driver", 2)
+    path = mcap_of(tmp_path / "a.mcap", [(PACKETS, driver.kind, "cdr", [driver.message([packet], 0)])])
+    for call in (lambda: next(iter(read_scans(path))), lambda: sensor_of(path)):
+        with pytest.raises(PointsError, match="a capture of a Hesai AT128, which cannot be decoded"):
+            call()
+
+
+LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+LIVOX_FIELDS = "uint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2", "livox_interfaces"])
+def test_points_in_livox_own_type(tmp_path: Path, package: str, version: int) -> None:
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores["ROS1_NOETIC" if version == 1 else "ROS2_HUMBLE"])
+    kind, of_point = f"{package}/msg/CustomMsg", f"{package}/msg/CustomPoint"
+    store.register(typesys.get_types_from_msg(LIVOX_POINT, of_point))
+    store.register(typesys.get_types_from_msg(f"{HEADER}{LIVOX_FIELDS}{package}/CustomPoint[] points\n", kind))
+    types, rng = store.types, np.random.default_rng(3)
+    sent, scans = [], []
+    for k, n in enumerate((200, 0, 201)):
+        xyz = rng.normal(0.0, 9.0, (n, 3)).astype(np.float32)
+        remission, offsets = rng.integers(0, 256, n), np.sort(rng.integers(0, 10**8, n))
+        points = [
+            types[of_point](offset_time=int(t), x=x, y=y, z=z, reflectivity=int(r), tag=0, line=k)
+            for t, (x, y, z), r in zip(offsets, xyz.tolist(), remission, strict=True)
+        ]
+        stamp = types["builtin_interfaces/msg/Time"](sec=1000, nanosec=10**8 * k)
+        counter = {"seq": k} if version == 1 else {}
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="livox_frame", **counter)
+        about = {"timebase": 10**12 + 10**8 * k, "point_num": n, "lidar_id": 1, "rsvd": np.zeros(3, np.uint8)}
+        message = types[kind](header=header, points=points, **about)
+        sent.append(bytes((store.serialize_ros1 if version == 1 else store.serialize_cdr)(message, kind)))
+        scans.append((xyz, remission, 1000.0 + 0.1 * k + 1e-9 * offsets))
+    path = tmp_path / ("a.bag" if version == 1 else "a.mcap")
+    if version == 1:
+        ros1_bag(path, [("/livox/lidar", f"{package}/CustomMsg", "ros1", sent)], 10**8)
+    else:
+        mcap_of(path, [("/livox/lidar", kind, "cdr", sent)], 10**8)
+    found = [*read_timed_scans(path)]
+    assert len(found) == 3
+    for scan, (xyz, remission, times_s) in zip(found, scans, strict=True):
+        np.testing.assert_array_equal(scan.points[:, :3], xyz)
+        np.testing.assert_array_equal(scan.points[:, 3], remission)
+        if len(xyz):
+            np.testing.assert_allclose(scan.times_s, times_s, atol=1e-6)
+    with pytest.raises(PointsError, match="damaged"):
+        CLOUD_READERS[(kind, "cdr") if version == 2 else (f"{package}/CustomMsg", "ros1")](memoryview(sent[0][:-1]))
+
+
 OTHERS = {
-    "pandar_msgs/PandarScan": "Hesai",
-    "pandar_msgs/msg/PandarScan": "Hesai",
-    "hesai_lidar/PandarScan": "Hesai",
-    "hesai_ros_driver/msg/UdpFrame": "Hesai",
-    "nebula_msgs/msg/NebulaPackets": "Nebula",
-    "rslidar_msg/msg/RslidarPacket": "RoboSense",
-    "rslidar_msgs/rslidarScan": "RoboSense",
-    "livox_ros_driver2/msg/CustomMsg": "Livox",
+    "pandar_msgs/PandarJumboPacket": "Hesai",
+    "hesai_ros_driver/msg/LossPacket": "Hesai",
+    "nebula_msgs/msg/RawPacketStamped": "Nebula",
+    "robosense_msgs/msg/MsopPacket": "RoboSense",
+    "livox_msgs/msg/LidarScan": "Livox",
 }
 
 
@@ -278,7 +452,7 @@ def test_an_ousters_packets_without_metadata(tmp_path: Path, metadata: str, erro
 def test_damaged_packets_of_an_ouster(key: tuple[str, str], content: bytes, cut: int) -> None:
     head = b"" if key[1] == "ros1" else b"\0\1\0\0"
     whole = PACKET_READERS[key](memoryview(head + sized(content)))
-    assert not isinstance(whole, VelodyneScan)
+    assert isinstance(whole, OusterPacket)
     assert bytes(whole.content) == content
     with suppress(PointsError):
         PACKET_READERS[key](memoryview((head + sized(content))[: len(head) + cut]))
