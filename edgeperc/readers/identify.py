@@ -89,6 +89,11 @@ def of_livox() -> NotSpinningError:
     )
 
 
+def of_mems(title: str) -> SensorError:
+    """What to say of sensors whose mirror sweeps: they have no beams of one elevation."""
+    return SensorError(f"the packets are of a {title}, of which no profile is built in. {_CHOICES}")
+
+
 def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) -> KnownSensor | None:
     """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs, or if it
     is ``beside`` a Velodyne and the topic does not name it.
@@ -96,6 +101,8 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
     lidar = senders.lidar(topic)
     if lidar is None or (beside and topic not in lidar.senders):
         return None
+    if lidar.mems is not None:
+        raise of_mems(lidar.mems.title)
     if lidar.row is None:
         raise of_livox()
     from .lidars import columns_of, open_spinning, payloads_of  # numba

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
+from .mems_packets import MemsStream, mems_format_of
 from .packets import Datagrams
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
@@ -74,16 +76,20 @@ def payloads_of(path: Path, sender: str | None, alive: Callable[[], None]) -> It
     return (datagram.payload for datagram in Datagrams(path, alive) if datagram.is_from(sender))
 
 
-def format_in(payloads: Iterable[memoryview]) -> Format | None:
-    """The format of the first packet with points; None if there is none.
+def stream_of(
+    path: Path, payload: memoryview, units: Iterable[memoryview]
+) -> tuple[SpinningStream | MemsStream, Callable[[memoryview], bool]] | None:
+    """What makes scans of the packets of a sensor like this one, and tells them from others; None if it has no points.
 
-    Raises PointsError: The first one is of a sensor whose packets are not decoded.
+    Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
     """
-    for payload in payloads:
-        if (row := format_of(payload)) is not None:
-            return row
-        if (name := name_of(payload)) is not None:
-            raise PointsError(not_decoded(name))
+    if (mems := mems_format_of(payload)) is not None:
+        return MemsStream(mems), lambda other: mems_format_of(other) is mems
+    if (found := format_of(payload)) is not None:
+        row, angles = open_spinning(path, found, units)
+        return SpinningStream(row, angles), partial(is_of, row)
+    if (name := name_of(payload)) is not None:
+        raise PointsError(not_decoded(name))
     return None
 
 
@@ -95,11 +101,17 @@ def is_of(row: Format, payload: memoryview) -> bool:
 
 def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryview | None) -> dict[str, Any]:
     """What packets in messages say about their sensor; see `decoders.describe`."""
-    row = format_in(payloads)
-    if row is None:
-        raise PointsError("the packets hold no points of a sensor that is known")
-    row, angles = open_spinning(path, row, [] if unit is None else [unit])
-    return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": columns_of(row, payloads)}
+    units = [] if unit is None else [unit]
+    for payload in payloads:
+        if (mems := mems_format_of(payload)) is not None:
+            return {"mems": mems.title}
+        if (found := format_of(payload)) is not None:
+            row, angles = open_spinning(path, found, units)
+            n = columns_of(row, payloads)
+            return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}
+        if (name := name_of(payload)) is not None:
+            raise PointsError(not_decoded(name))
+    raise PointsError("the packets hold no points of a sensor that is known")
 
 
 def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None]) -> Iterator[TimedScan]:
@@ -116,6 +128,12 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
             if is_of(row, payload):
                 yield from stream.add(payload)
         yield from stream.end()
+    elif lidar.mems is not None:
+        frames = MemsStream(lidar.mems)
+        for payload in payloads_of(path, first, alive):
+            if mems_format_of(payload) is lidar.mems:
+                yield from frames.add(payload)
+        yield from frames.end()
     else:
         livox = LivoxStream()
         for datagram in Datagrams(path, alive):

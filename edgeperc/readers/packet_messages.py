@@ -228,21 +228,19 @@ class OusterMessages(_Turns):
 
 
 class LidarMessages(_Turns):
-    """Turns of a Hesai or RoboSense, by the angles that a file beside the bag has, or a packet of the unit."""
+    """Scans of a Hesai or RoboSense; what spins has its angles in a file beside the bag, or in a packet of the unit."""
 
     def __init__(self, path: Path, unit: memoryview | None) -> None:
         self._path, self._units = path, [] if unit is None else [unit]
 
     def add(self, message: LidarPackets, stamp_s: float) -> Iterator[TimedScan]:
         """The turns that end in a message. Raises PointsError: The angles are not known, or the packets not decoded."""
-        from .lidars import format_in, is_of, open_spinning  # numba
-        from .spinning_packets import SpinningStream
+        from .lidars import stream_of  # numba
 
         for stamp_ns, packet in message.packets:
-            if self._stream is None and (row := format_in([packet])) is not None:
-                self._row, angles = open_spinning(self._path, row, self._units)
-                self._stream = SpinningStream(self._row, angles)
-            if self._stream is not None and is_of(self._row, packet):
+            if self._stream is None and (found := stream_of(self._path, packet, self._units)) is not None:
+                self._stream, self._is_of = found
+            if self._stream is not None and self._is_of(packet):
                 yield from map(self._of_computer, self._stream.add(packet))
                 self._last_s = 1e-9 * stamp_ns if stamp_ns else stamp_s
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import calendar
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -79,11 +79,12 @@ def _tail(body: int, date: int, micros: int, speed: int) -> Clock:
     return Clock("hesai", body + date, body + micros, body + speed)
 
 
-def _xt(name: str, n: int, elevations: Sequence[float]) -> Format:
-    body = 12 + 8 * (2 + 4 * n)
-    fires_us = tuple(6.0 + 1.512 * (32 // n) * k for k in range(n))
+def _xt(name: str, elevations: Sequence[float], fires_us: Iterable[float], n_blocks: int = 8) -> Format:
+    n = len(elevations)
+    body = 12 + n_blocks * (2 + 4 * n)
+    title = f"Hesai {name.replace('p', 'P', 1).replace('xt', 'XT').replace('m', 'M')}"
     return Format(
-        name, f"Hesai {name.replace('p', 'P', 1).replace('xt', 'XT')}", 12, 8, n, 4, (body + 28,), b"", 2, fires_us,
+        name, title, 12, n_blocks, n, 4, (body + 28,), b"", 2, tuple(fires_us),
         _tail(body, 13, 19, 11), reference=-1, mm_at=9, elevations_deg=tuple(elevations),
     )  # fmt: skip
 
@@ -98,13 +99,17 @@ _FORMATS = (
            _tail(1240, 16, 10, 8), reference=-1, late_us=-28.58),
     Format("pandar64", "Hesai Pandar64", 8, 6, 64, 3, (1194, 1198), b"", 2, _NO_FIRES[:64],
            _tail(1172, 16, 10, 8), reference=-1, late_us=-42.58, mm_at=5),
-    _xt("pandarxt-32", 32, range(15, -17, -1)),
-    _xt("pandarxt-16", 16, range(15, -17, -2)),
+    _xt("pandarxt-32", range(15, -17, -1), (6.0 + 1.512 * k for k in range(32))),
+    _xt("pandarxt-16", range(15, -17, -2), (6.0 + 3.024 * k for k in range(16))),
+    # Two lasers at a time.
+    _xt("pandarxt-32m", [round(19.5 - 1.3 * k, 1) for k in range(32)], (6.0 + 2.888 * (k % 16) for k in range(32)), 6),
     Format("pandarqt-64", "Hesai PandarQT-64", 12, 4, 64, 4, (1068, 1072), b"", 2, _NO_FIRES[:64],
            _tail(1044, 18, 12, 10), late_us=25.71, mm_at=9),
     # Whether there are bytes of confidence and of functional safety is in the packet.
     Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
            _tail(788, 15, 21, 13), reference=-1, mm_at=9),
+    Format("qt128", "Hesai QT128C2X", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
+           _tail(788, 15, 21, 13), reference=-1, late_us=9.0, mm_at=9),
     Format("rs-16", "RoboSense RS-LiDAR-16", 42, 12, 32, 3, (1248,), _OLD, 4,
            tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), _DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
            lasers=16),
@@ -140,13 +145,15 @@ _OTHER_MODELS = {4: "RS-Ruby", 5: "RS-Ruby Lite"}
 _HESAI = {
     (6, 1, 32, 8): "pandarxt-32",
     (6, 1, 16, 8): "pandarxt-16",
+    (6, 1, 32, 6): "pandarxt-32m",
     (3, 1, 64, 4): "pandarqt-64",
     (1, 4, 128, 2): "ot128",
+    (3, 2, 128, 2): "qt128",
 }
 _HESAI_NAMES = {
     (4, 3): "AT128",
     (3, 2): "QT128",
-    (6, 1): "XT32M",
+    (6, 1): "XT",
     (1, 8): "JT",
     (2, 5): "ET25",
     (4, 7): "ATX",
@@ -167,7 +174,7 @@ def format_of(payload: memoryview) -> Format | None:
     elif head[:2] == b"\xee\xff" and size > 12:
         name = "pandar64" if head[2:4] == b"\x40\x06" else _HESAI.get((head[2], head[3], head[6], head[7]), "")
         row = FORMATS.get(name)
-        if name == "ot128":
+        if name in ("ot128", "qt128"):
             row = _with_options(FORMATS[name], head[11], size)
     elif head[:8] == _MSOP and size > 32:
         is_new = bytes(payload[31:33]) == b"\x03\x04"

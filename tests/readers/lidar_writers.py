@@ -43,6 +43,8 @@ MODELS = {
         Model("pandar64", 64, 6, 64, 0.004, layout="<"),
         Model("pandarxt-32", 32, 8, 32, 0.004, 0.18, layout="<"),
         Model("pandarxt-16", 16, 8, 16, 0.004, 0.18, layout="<"),
+        Model("pandarxt-32m", 32, 6, 32, 0.004, 0.18, layout="<"),
+        Model("qt128", 128, 2, 128, 0.004, 0.4, layout="<"),
         Model("pandarqt-64", 64, 4, 64, 0.004, 0.6, layout="<"),
         Model("ot128", 128, 2, 128, 0.004, 0.2, layout="<"),
         Model("rs-16", 16, 12, 32, 0.005, 0.4, second="firing"),
@@ -62,6 +64,8 @@ DATE = bytes((25, 6, 15, 15, 6, 40))  # T0_S
 def unit_angles(model: Model, seed: int = 5) -> NDArray[np.float64]:
     """Elevation and azimuth of each laser of a unit, in hundredths of a degree, in an order of its own."""
     rng = np.random.default_rng(seed)
+    if model.name == "pandarxt-32m":
+        return np.round(np.stack([19.5 - 1.3 * np.arange(32), np.zeros(32)], 1), 1)
     if model.name.startswith("pandarxt"):
         return np.stack([np.linspace(15, -16 if model.lasers == 32 else -15, model.lasers), np.zeros(model.lasers)], 1)
     top, bottom = (89.0, 0.5) if model.name in ("rs-airy", "rs-bpearl", "rs-bpearl-4") else (15.0, -25.0)
@@ -111,7 +115,7 @@ def packets_of(
 
 def _packet(model: Model, blocks: Sequence[tuple[int, Any, Any]], rpm: int, micros: int) -> bytes:
     name = model.name
-    wide = name.startswith(("pandarxt", "pandarqt", "ot128"))
+    wide = name.startswith(("pandarxt", "pandarqt", "ot128", "qt128"))
     flag = b"\xff\xee" if name == "pandar40p" or (model.layout == ">" and "ruby" not in name) else b""
     flag = b"\xfe\x00" if "ruby" in name else flag
     body = b""
@@ -145,10 +149,10 @@ def _hesai_packet(model: Model, body: bytes, rpm: int, micros: int) -> bytes:
     if model.name in ("pandar40p", "pandar64"):
         head = b"" if model.name == "pandar40p" else bytes((0xEE, 0xFF, 64, 6, 0, 4, 1, 0))
         return head + body + bytes(8) + speed + stamp + b"\x37\x42" + date
-    version = {"pandarxt": (6, 1), "pandarqt": (3, 1), "ot128": (1, 4)}[model.name.partition("-")[0]]
-    options = 0x15 if model.name == "ot128" else 1  # confidence, functional safety, numbered
+    version = {"pandarxt": (6, 1), "pandarqt": (3, 1), "ot128": (1, 4), "qt128": (3, 2)}[model.name.partition("-")[0]]
+    options = 0x15 if model.name in ("ot128", "qt128") else 1  # confidence, functional safety, numbered
     head = bytes((0xEE, 0xFF, *version, 0, 0, model.lasers, model.blocks, 0, 4, 1, options))
-    if model.name == "ot128":
+    if model.name in ("ot128", "qt128"):
         tail = bytes(4 + 17 + 12) + b"\x37" + speed + date + stamp + b"\x42" + bytes(4 + 4)
     elif model.name.startswith("pandarxt"):
         tail = bytes(10) + b"\x37" + speed + date + stamp + b"\x42" + bytes(4)
@@ -226,6 +230,33 @@ def livox_packets(kind: int, xyz_m: NDArray[np.float64], remission: NDArray[np.i
         else:
             head = struct.pack("<BHHHHBBB", 0, 36 + len(body), 4800, n // returns, number % 65536, 0, kind, 1)
             packets.append(head + bytes(12 + 4) + stamp_ns.to_bytes(8, "little") + body)
+    return packets
+
+
+def mems_packets(
+    name: str, units: NDArray[np.int64], places: NDArray[np.int64], remission: NDArray[np.int64], per_frame: int
+) -> list[bytes]:
+    """Of a RoboSense M1 (distance, pitch and yaw in hundredths of a degree) or E1 (distance, and a direction of 2**15).
+
+    A packet comes every 0.9 ms; packets are counted anew after ``per_frame`` of them.
+    """
+    size, n_blocks, per_block, lidar = (1210, 25, 5, 0x10) if name == "m1" else (1200, 96, 1, 0x22)
+    packets, n = [], n_blocks * per_block
+    for k in range(len(units) // n):
+        micros = 900 * k
+        head = bytes.fromhex("55aa5aa5") + struct.pack(">HHBB", k % per_frame + 1, 0x0100, 4, 0)
+        head += (T0_S + micros // 10**6).to_bytes(6, "big") + struct.pack(">I", micros % 10**6) + bytes(10)
+        body = b""
+        for b in range(n_blocks):
+            body += bytes([5 * b, 1]) if name == "m1" else struct.pack(">H", 8 * b)
+            for i in range(n * k + per_block * b, n * k + per_block * (b + 1)):
+                body += struct.pack(">H", units[i])
+                values = places[i].tolist()
+                body += (
+                    struct.pack(">HH", *(v + 32768 for v in values)) if name == "m1" else struct.pack(">hhh", *values)
+                )
+                body += bytes([remission[i], 0]) + (b"\0" if name == "m1" else b"")
+        packets.append((head + bytes([lidar, 100]) + body).ljust(size, b"\0"))
     return packets
 
 

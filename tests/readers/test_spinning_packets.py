@@ -26,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 FIRES_US: dict[str, Any] = {
     "pandarxt-32": 6 + 1.512 * np.arange(32),
     "pandarxt-16": 6 + 3.024 * np.arange(16),
+    "pandarxt-32m": 6 + 2.888 * (np.arange(32) % 16),
     "rs-16": np.concatenate([2.8 * np.arange(16), 55.5 + 2.8 * np.arange(16)]),
     "helios-16": np.concatenate([1.73 * np.arange(16), 55.56 + 1.73 * np.arange(16)]),
     "rs-bpearl-4": 1.668 * np.arange(32),
@@ -203,15 +204,15 @@ def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, na
 
 OTHERS = [
     ("Hesai AT128", bytes.fromhex("eeff0403000080020004017f") + bytes(1106)),
-    ("Hesai QT128", bytes.fromhex("eeff03020000800200040107") + bytes(1115)),
-    ("Hesai XT32M", bytes.fromhex("eeff06010000200600040101") + bytes(808)),
+    ("Hesai QT128", bytes.fromhex("eeff03020000800300040107") + bytes(1115)),
+    ("Hesai XT", bytes.fromhex("eeff06010000200500040101") + bytes(808)),
     ("Hesai Pandar20", b"\xee\xff\x14\x14\0\x04" + bytes(1264)),
     ("Hesai sensor of 99 lasers (version 9.9", bytes.fromhex("eeff09090000630200040101") + bytes(808)),
     ("RoboSense RS-Ruby", bytes.fromhex("55aa050a5aa550a0") + bytes(22) + b"\x04" + bytes(1217)),
     ("RoboSense RS-Ruby Plus", bytes.fromhex("55aa055a") + bytes(27) + b"\x05" + bytes(48)
      + b"\xfe".ljust(388, b"\0") * 3 + bytes(4)),
     ("RoboSense sensor", bytes.fromhex("55aa050a5aa550a0") + bytes(1240)),  # MSOP of the RS-16 and RS-32
-    ("RoboSense sensor", bytes.fromhex("55aa055a") + bytes(1206)),  # of the M1
+    ("RoboSense sensor", bytes.fromhex("55aa055a") + bytes(1206)),
     ("Livox sensor", bytes(1380)),
     ("Livox sensor", b"\0" + struct.pack("<H", 1380) + bytes(1377)),  # 96 points of 14 bytes behind 36
     ("Livox sensor", b"\0" + struct.pack("<H", 804) + bytes(801)),  # 96 points of 8 bytes
