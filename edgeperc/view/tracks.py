@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice, pairwise
+from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Perception
 from ..types.points import Bytes, Floats, Points
 from .canvas import free_place
-from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
+from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, SCENE_COLORS, color_of, rgb
 from .content import drawable_boxes, drawable_points, in_model_frame, paint_points
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ _BEHIND_M, _BESIDE_M = 22, 28
 _WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
 # Values of a pixel of a flattened scan: 0 empty, 1 road, 2 to 4 a background point by height, from 5 a class.
 _ROAD, _POINT, _CLASS = 1, 2, 5
-_OTHER = _CLASS + len(CLASS_COLORS)
+_COLORED = (*SCENE_COLORS, *CLASS_COLORS)  # objects over the surroundings; others over both
+_OTHER, _DRIVABLE = _CLASS + len(_COLORED), _CLASS + _COLORED.index("drivable")
 AT_ONCE = 50  # pictures in memory: 0.8 MB each, which are 2.3 GB of five minutes
 
 
@@ -72,12 +73,12 @@ def flatten_scan(points: Points, perception: Perception | None = None) -> bytes:
     x, y = points[:, :2].astype(np.float64).T
     ground = find_ground(points) if perception is None else heights_above(perception.ground, points)
     level = np.clip(np.floor(ground.height_m / 1.2 + 0.75), 0, 2)
-    order = [*CLASS_COLORS]
-    as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
+    of_class = {name: _CLASS + k for k, name in enumerate(_COLORED)}
+    as_pixel = np.array([of_class.get(name.casefold(), _OTHER) for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
     col, row = np.floor((x + _BEHIND_M) * _PX_PER_M), np.floor((_BESIDE_M - y) * _PX_PER_M)
     # The road is shown as a surface; its points would only enlarge the file.
-    inside = (col >= 0) & (col < _WIDTH) & (row >= 0) & (row < _HEIGHT) & (value != _CLASS + order.index("drivable"))
+    inside = (col >= 0) & (col < _WIDTH) & (row >= 0) & (row < _HEIGHT) & (value != _DRIVABLE)
     shown = np.flatnonzero(inside)
     shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
     image[row[shown].astype(np.intp), col[shown].astype(np.intp)] = value[shown]
@@ -133,9 +134,7 @@ def draw_tracks(
     for given, what in ((under, "flattened scans"), (mountings, "mountings")):
         if given and len(given) != len(scans):
             raise TrackingError(f"got {len(given)} {what} with tracks of {len(scans)}; expected one for each")
-    times_s = [0.0]
-    for before, after in pairwise(scans):
-        times_s.append(times_s[-1] + elapsed_s(before.stamp_s, after.stamp_s))
+    times_s = [*accumulate((elapsed_s(a.stamp_s, b.stamp_s) for a, b in pairwise(scans)), initial=0.0)]
     lasted = [max(20, round(1e3 * (after - before))) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
     pictures = _pictures(scans, times_s, under, mountings, title or "Tracks", tail_s)
     stream = io.BytesIO()
@@ -199,17 +198,17 @@ def _layer_colors() -> Bytes:
     """Color of each value of a flattened scan, (values, 3) uint8."""
     panel, low, high, drivable = rgb([PANEL, LOW, HIGH, CLASS_COLORS["drivable"]])
     points = [panel + share * (color - panel) for color, share in ((low, 0.5), (low, 0.95), (high, 0.6))]
-    classes = [panel + 0.85 * (color - panel) for color in rgb([*CLASS_COLORS.values(), color_of("")])]
+    classes = [panel + 0.85 * (color - panel) for color in rgb([color_of(name) for name in (*_COLORED, "")])]
     colors = [panel, panel + 0.55 * (drivable - panel), *points, *classes]
     return np.asarray((255.0 * np.array(colors)).round(), np.uint8)
 
 
 def _palette(Image: Any) -> Any:
     """Make an image with the palette of all frames: all drawn colors, and their blends with the backgrounds."""
-    front = np.concatenate([rgb([INK, FAINT, *CLASS_COLORS.values(), color_of("")]), _layer_colors()[_POINT:] / 255.0])
-    ground = np.concatenate([rgb([PANEL, GROUND, FRAME]), _layer_colors()[[_ROAD]] / 255.0])
+    layer, front = _layer_colors() / 255.0, rgb([INK, FAINT, *CLASS_COLORS.values(), color_of("")])
+    ground = np.concatenate([rgb([PANEL, GROUND, FRAME]), layer[[_ROAD]]])
     edges = [back + share * (front - back) for back in ground for share in (0.35, 0.7)]
-    colors = np.unique((255.0 * np.concatenate([ground, front, *edges])).round().astype(np.uint8), axis=0)[:256]
+    colors = np.unique((255.0 * np.concatenate([ground, front, layer, *edges])).round().astype(np.uint8), axis=0)
     picture = Image.new("P", (1, 1))
     picture.putpalette(colors.tobytes() + bytes(768 - colors.size))
     return picture
@@ -276,17 +275,20 @@ def _write_frame(pen: Any, title: str, facts: str, labels: set[str], fonts: dict
     pen.rectangle([0, 0, width, head], fill=GROUND)
     pen.rectangle([0, foot, width, foot + _FINE * _FOOT], fill=GROUND)
     middle = head // 2
-    # A longer title does not fit, and would take minutes to measure.
-    title = "".join(c if c.isprintable() and ord(c) < 256 else "?" for c in title[: width // 8])
+    # A longer text does not fit, and would take minutes to measure.
+    texts = (title, *(label for label in CLASS_COLORS if label in labels), *sorted(labels - {*CLASS_COLORS}))
+    title, *classes = ("".join(c if c.isprintable() and ord(c) < 256 else "?" for c in t[: width // 8]) for t in texts)
     facts_left = width - 32 - pen.textlength(facts, font=fonts[17])
     while len(title) > 1 and pen.textlength(title, font=fonts[17]) > facts_left - 64:
         title = f"{title[:-4]}..."
     pen.text((32, middle), title, fill=INK, font=fonts[17], anchor="lm")
     pen.text((width - 32, middle), facts, fill=FAINT, font=fonts[17], anchor="rm")
     x, middle = 32.0, foot + _FINE * _FOOT // 2
-    for label in [label for label in CLASS_COLORS if label in labels]:
+    for label in classes:
         pen.rectangle([x, middle - 10, x + 20, middle + 10], fill=color_of(label))
         pen.text((x + 30, middle), label, fill=INK, font=fonts[14], anchor="lm")
         x += 30 + pen.textlength(label, font=fonts[14]) + 36
     meaning = f"line: last {tail_s:g} s · arrow: next second · thin box: not detected now"
+    room = width - 64 - pen.textlength(meaning, font=fonts[13])
+    pen.rectangle([room, foot, width, foot + _FINE * _FOOT], fill=GROUND)  # over classes for which there is no room
     pen.text((width - 32, middle), meaning, fill=FAINT, font=fonts[13], anchor="rm")
