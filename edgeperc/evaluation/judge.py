@@ -32,7 +32,7 @@ from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception, PointLabels, TopView
-from ..types.points import Bytes, Floats, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Floats, Labels, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .causes import count_causes
@@ -185,9 +185,7 @@ class Judge:
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:
-            x, y = truth.points[:, 0], truth.points[:, 1]
-            shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
-            mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
+            mistakes = Mistakes(truth.name, truth.drive, truth.points, np.zeros(len(truth.points), np.uint8))
             if self.box_classes or perception.points is not None:
                 seen = (box for box, n in truth.counted if n >= FEWEST_RETURNS)
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
@@ -195,7 +193,7 @@ class Judge:
                 mistakes = self._count_boxes(tallies, truth, perception, mistakes)
                 self._count_ap(tallies, truth, perception.boxes, scan_boxes)
             if perception.points is not None:
-                mistakes = self._count_points(tallies, truth, perception.points, mistakes, shown)
+                mistakes = self._count_points(tallies, truth, perception.points, mistakes)
         if perception.top_view is not None and self.mounted is None:
             self._count_cells(tallies, truth, perception.top_view)
         return Record(truth.name, truth.drive, tallies), mistakes
@@ -249,7 +247,7 @@ class Judge:
         tallies["centers",] = count_centers(predicted, to_find, ignored, truth.drive)
 
     def _count_points(
-        self, tallies: dict[tuple[str, ...], Any], truth: Truth, predicted: PointLabels, mistakes: Mistakes, shown: Mask
+        self, tallies: dict[tuple[str, ...], Any], truth: Truth, predicted: PointLabels, mistakes: Mistakes
     ) -> Mistakes:
         """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects of classes without
         evaluated boxes count as found if at least half of their points have their label.
@@ -295,7 +293,7 @@ class Judge:
         wrong = np.where(counted & (own != true), np.where(true > 0, 1, 2), 0).astype(np.uint8)
         n_objects = int(np.count_nonzero(counted & ((true > 0) | (own > 0))))
         share = int(np.count_nonzero(wrong)) / max(n_objects, 1)
-        return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
+        return replace(mistakes, wrong=wrong, found=tuple(hit), missed=tuple(missed), wrong_share=share)
 
     def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, view: TopView) -> None:
         """Count the labels of cells for each table, and the probability of road if the true road is known."""

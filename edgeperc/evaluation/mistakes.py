@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..types.perception import Box
-from ..types.points import Bytes, Points
+from ..types.points import Bytes, Mask, Points
 from ..view.canvas import (
     Label,
     add_axes,
@@ -35,7 +35,7 @@ class Mistakes:
 
     name: str
     drive: str
-    points: Points  # to draw: x, y, z [m] in the sensor frame, remission
+    points: Points  # x, y, z [m] in the sensor frame, remission
     wrong: Bytes  # 1: point of an object with another label; 2: background with that of an object
     found: tuple[Box, ...] = ()
     missed: tuple[tuple[Box, int], ...] = ()  # with the number of points in each
@@ -46,6 +46,21 @@ class Mistakes:
     def n_errors(self) -> float:
         """Number of missed and false boxes, plus `wrong_share` to rank scans with equal numbers; 0 without mistakes."""
         return len(self.missed) + len(self.false) + self.wrong_share
+
+    @property
+    def reach_m(self) -> tuple[float, float, float]:
+        """How far a panel shows behind, ahead and to each side: all around, if a box in it would lie outside."""
+        places = [box.center[:2] for box in drawable_boxes([*(box for box, _ in self.missed), *self.false])]
+        if all(-_BEHIND_M < x < _FAR_M and abs(y) < _BESIDE_M for x, y in places):
+            return _BEHIND_M, _FAR_M, _BESIDE_M
+        reach_m = max(_FAR_M, *(_BEHIND_M + max(abs(x), abs(y)) / _ASPECT for x, y in places))
+        return reach_m, reach_m, reach_m * _ASPECT
+
+    @property
+    def shown(self) -> Mask:
+        """Which points a panel shows, (n,) bool."""
+        (behind, ahead, beside), (x, y) = self.reach_m, self.points[:, :2].T
+        return drawable_points(self.points) & (x > -behind) & (x < ahead) & (np.abs(y) < beside)
 
     @property
     def summary(self) -> str:
@@ -60,21 +75,18 @@ class Mistakes:
             parts.append(f"missed: {listed([box for box, _ in self.missed])} ({n_points:,} points)")
         if self.false:
             parts.append(f"false: {listed(self.false)}")
-        n_wrong = int(np.count_nonzero(self.wrong))
+        n_wrong, n_shown = (int(np.count_nonzero(each)) for each in (self.wrong, self.wrong[self.shown]))
         if n_wrong:
-            parts.append(f"{n_wrong:,} point{'s' * (n_wrong != 1)} wrong")
+            farther = f", {n_wrong - n_shown:,} of them farther" if n_shown < n_wrong else ""
+            parts.append(f"{n_wrong:,} point{'s' * (n_wrong != 1)} wrong{farther}")
         return "; ".join(parts) or "no mistake"
 
 
-# Sizes in pixels; the view reaches 27 m to each side and 52 m ahead.
-_WIDTH, _MARGIN, _TOP, _GAP, _CAPTION = 1600, 28, 168, 20, 84
-_RIGHT_M, _FAR_M = 27.0, 52.0
+_WIDTH, _MARGIN, _TOP, _GAP, _CAPTION = 1600, 28, 168, 20, 84  # pixels
+_BEHIND_M, _FAR_M, _BESIDE_M = 3.0, 52.0, 27.0  # of a panel that does not show the whole turn
+_ASPECT = 2.0 * _BESIDE_M / (_BEHIND_M + _FAR_M)
 _LEGEND = (
-    (
-        MISSED,
-        "missed",
-        "object that was not found, with its number of points; dots: points of objects with another label",
-    ),
+    (MISSED, "missed", "object that was not found, its number of points; dots: points of objects with another label"),
     (FALSE, "false", "box where there is no object; dots: background points with the label of an object"),
     (FOUND, "found", "object that was found"),
 )
@@ -88,7 +100,7 @@ def draw_mistakes(
     columns = max(1, min(columns, max(1, len(wrong))))
     # A single panel takes half of the width.
     width = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // max(columns, 2)
-    height = round(width * (_FAR_M + 3.0) / (2.0 * _RIGHT_M))
+    height = round(width / _ASPECT)
     rows = -(-len(wrong) // columns)
     figure = new_figure(_WIDTH, _TOP + (rows * (height + _CAPTION + _GAP) if wrong else 90))
     heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes"
@@ -102,8 +114,7 @@ def draw_mistakes(
         write_at(figure, end + 8, 84 + 27 * k, name, fontsize=14.0, fontweight="bold")
         write_at(figure, _MARGIN + 128, 84 + 27 * k, meaning, fontsize=14.0, color=FAINT)
     if not wrong:
-        text = "No mistakes: every object was found, and there are no false detections."
-        text = text if scans else "No scans were given."
+        text = "No mistakes: every object was found, and none is false." if scans else "No scans were given."
         write_at(figure, _MARGIN, _TOP + 36, text, fontsize=17.0)
     for k, scan in enumerate(wrong):
         left = _MARGIN + k % columns * (width + _GAP)
@@ -123,17 +134,17 @@ def draw_mistakes(
 def _draw_panel(axes: Any, scan: Mistakes) -> None:
     from matplotlib.patches import Polygon
 
-    axes.set_xlim(_RIGHT_M, -_RIGHT_M)  # y grows to the left
-    axes.set_ylim(-3.0, _FAR_M)
+    behind, ahead, beside = scan.reach_m
+    axes.set_xlim(beside, -beside)  # y grows to the left
+    axes.set_ylim(-behind, ahead)
     for ring in (15.0, 30.0, 45.0):
-        turn = np.linspace(-math.pi / 2.0, math.pi / 2.0, 90)
+        turn = np.linspace(-math.pi, math.pi, 180)
         axes.plot(ring * np.sin(turn), ring * np.cos(turn), color=INK, alpha=0.16, linewidth=0.8)
         write_text(axes, 0.0, ring, f"{ring:.0f} m", color=FAINT, fontsize=10.5, ha="center", va="bottom", alpha=0.8)
     sensor = np.array([[0.0, 1.0], [0.8, -1.2], [-0.8, -1.2]])
     axes.add_patch(Polygon(sensor, closed=True, facecolor=INK))
-    seen = drawable_points(scan.points)
     for kind, color, size, alpha in ((0, "#66737f", 0.7, 0.6), (2, FALSE, 7.0, 0.9), (1, MISSED, 7.0, 0.9)):
-        shown = scan.points[seen & (scan.wrong == kind)]
+        shown = scan.points[scan.shown & (scan.wrong == kind)]
         axes.scatter(shown[:, 1], shown[:, 0], s=size, c=color, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
     boxes = [(box, FOUND, "-", "") for box in scan.found]
     boxes += [(box, FALSE, "--", box.label) for box in scan.false]
@@ -145,6 +156,6 @@ def _draw_panel(axes: Any, scan: Mistakes) -> None:
         footprint = box.corners()[:, ::-1]
         style = {"edgecolor": color, "linestyle": line, "linewidth": 2.2 if text else 1.2, "zorder": 5 if text else 4}
         axes.add_patch(Polygon(footprint, closed=True, fill=False, **style))
-        if text and abs(box.center[1]) < _RIGHT_M and -3.0 < box.center[0] < _FAR_M:
+        if text:
             labels.append(Label(area_of(axes, footprint), text, color))
     place_labels(axes, labels, [area_of(axes, sensor)], fontsize=12.0)
