@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import json
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..system.atomic import open_atomic
+from ..system.clock import step_between
 from ..system.printable import printable
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView, scan_of
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
 _STEP_M, _FARTHEST_M = 0.01, 320.0
 _FEWEST_POINTS, _MOST_POINTS = 3000, 64 * 3000
 _SHORTEST_S, _LONGEST_S = 0.001, 1.0
-_MOST_WARNINGS = 5
 
 
 def write_html(perception: Perception, points: ArrayLike, path: str | Path, *, title: str = "") -> None:
@@ -89,10 +90,10 @@ class DrivePage:
         self.n_points, self.every = _MOST_POINTS, 1
         self._title, self._max_bytes = title, max_bytes
         self._n = self._most = self.n_bytes = 0
-        self._stamp_s = self._time_s = 0.0  # of the last scan, kept or not: its own time, and when it is played
+        self._stamp_s, self._time_s = -math.inf, 0.0  # the latest scan's own time, and when the last one is played
         self._classes: dict[str, int] = {}
         self._scans: list[_Thin] = []
-        self._fitness: dict[str, None] = {}
+        self._fitness: dict[str, str] = {}  # one of each kind, whatever the numbers in it
 
     def __len__(self) -> int:
         """Number of scans that are kept."""
@@ -123,13 +124,13 @@ class DrivePage:
         given = scan_of(perception, points)
         step_s = np.clip(np.nan_to_num(np.subtract(stamp_s, self._stamp_s)), _SHORTEST_S, _LONGEST_S)
         self._time_s += float(step_s) if self._n else 0.0
-        self._stamp_s = stamp_s
+        if step_between(self._stamp_s, stamp_s) != "late":
+            self._stamp_s = stamp_s
         self._n += 1
         if (self._n - 1) % self.every:
             return
         for line in perception.fitness:
-            if len(self._fitness) < _MOST_WARNINGS:
-                self._fitness[line] = None
+            self._fitness.setdefault(re.sub(r"[-+\d.]+", "", line), line)
         scan, xyz, remission, label = _scan(perception, given, self._classes, tracks)
         names = [*self._classes]
         near = (np.abs(xyz) < _FARTHEST_M).all(axis=1)
@@ -168,7 +169,7 @@ class DrivePage:
         facts = f"{len(self._scans):,} scans ({kept}), {thinned}"
         texts = (scan.to_json() for scan in self._scans)
         times_s = [round(scan.time_s, 3) for scan in self._scans]
-        _fill_page(path, self._title or "A drive", facts, self._fitness, self._classes, texts, times_s)
+        _fill_page(path, self._title or "A drive", facts, self._fitness.values(), self._classes, texts, times_s)
 
 
 @dataclass(frozen=True, eq=False)
