@@ -289,7 +289,8 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
             line = canvas.area_of(axes, [[-_HALF_STRIP_M, x_m], [_HALF_STRIP_M, x_m]])
             labels.append(canvas.Label(line, f"{kind} {x_m:.1f} m", FAINT))
     if text:
-        labels.append(canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
+        first = 0 if arrow is None else len(labels)  # without an arrow, no other panel says it
+        labels.insert(first, canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = canvas.place_labels(axes, labels, avoid)
     seen = f"scores; {n_farther} farther" if n_farther else "scores"
     seen = _omitted(seen, n_omitted) if n_omitted else f"{seen}; gray: not observed"  # all is wider than the panel
