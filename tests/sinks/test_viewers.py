@@ -622,13 +622,15 @@ def test_a_long_drive_stays_within_its_limit(tmp_path: Path) -> None:
 
 
 def test_times_of_a_page(tmp_path: Path) -> None:
-    """Pauses are cut to a second, and time never runs backwards."""
+    """Pauses are cut to a second, late scans take no time, none runs backwards. Each kind of warning is told."""
     page = DrivePage()
-    for stamp_s in (5.0, 5.1, 100.0, 99.0, math.nan, 99.2):
-        page.add(a_perception(a_scan()), a_scan(), stamp_s)
+    for k, stamp_s in enumerate((5.0, 5.1, 4.95, 5.2, 100.0, 99.0, math.nan, 99.2)):
+        page.add(replace(a_perception(a_scan()), fitness=(f"{k} rows", *["a room"] * (k > 6))), a_scan(), stamp_s)
     page.write(tmp_path / "drive.html")
     times = scene_of(tmp_path / "drive.html")["times"]
-    assert times[:3] == pytest.approx([0.0, 0.1, 1.1])
+    assert times[:5] == pytest.approx([0.0, 0.1, 0.101, 0.201, 1.201])
+    told = (tmp_path / "drive.html").read_text().split("<p class=warning>")[1:]
+    assert [text.partition("<")[0] for text in told] == ["0 rows", "a room"]
     assert all(a < b for a, b in pairwise(times))
 
 

@@ -183,6 +183,18 @@ def test_a_turn_of_few_beams_has_no_stripes_and_boxes_outside_are_counted(
     assert headings[0] == "scores; 1 farther; gray: not observed"
 
 
+@pytest.mark.parametrize("is_free", [False, True])
+def test_what_no_other_panel_says_is_placed_first(
+    is_free: bool, scan: np.ndarray, perception: Perception, monkeypatch: pytest.MonkeyPatch, matplotlib: None
+) -> None:
+    view_above = perception.require_top_view()
+    labels = np.full_like(view_above.labels, int(is_free))
+    placed: list[list[str]] = []
+    monkeypatch.setattr(canvas, "place_labels", lambda _, labels, *__: placed.append([x.text for x in labels]) or 0)
+    view.draw(replace(perception, top_view=replace(view_above, labels=labels)), scan)
+    assert placed[0][-1 if is_free else 0] == ("free ahead: at least 46 m" if is_free else "not free 6 m ahead")
+
+
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perception) -> None:
     many = pixels(view.draw(replace(perception, fitness=("a warning", "words " * 100)), scan))
@@ -406,15 +418,25 @@ def test_mistakes_are_summed_up(scan: np.ndarray) -> None:
     assert mistakes.n_errors == 4.25
     assert some_mistakes(scan, found=(CAR,)).summary == "no mistake"
     assert some_mistakes(scan, found=(CAR,)).n_errors == 0.0
-    wrong = replace(some_mistakes(scan), wrong=np.where(np.arange(len(scan)) == 7, 2, 0).astype(np.uint8))
-    assert wrong.summary == "1 point wrong"
+    for point, farther in ((6000, ""), (int(scan[:6000, 0].argmin()), ", 1 of them farther")):
+        wrong = replace(some_mistakes(scan), wrong=np.where(np.arange(len(scan)) == point, 2, 0).astype(np.uint8))
+        assert wrong.summary == f"1 point wrong{farther}"
+    # What is summed up lies in the panel, which keeps its shape.
+    for x, y in ((-30.0, 5.0), (20.0, -40.0), (70.0, 3.0), (3.0, -90.0)):
+        mistakes = some_mistakes(scan, false=(replace(CAR, center=(x, y, -1.0)),))
+        behind, ahead, beside = mistakes.reach_m
+        assert -behind < x < ahead
+        assert abs(y) < beside
+        assert (behind + ahead) / beside == pytest.approx(55.0 / 27.0)
+        assert mistakes.shown.sum() == len(scan) - 1  # all that are finite
+    assert (wrong.reach_m, wrong.shown.sum() < 0.5 * len(scan)) == ((3.0, 52.0, 27.0), True)
 
 
 @pytest.mark.usefixtures("matplotlib")
 def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path: Path) -> None:
     right = some_mistakes(scan, found=(CAR, VAN))
     missed = some_mistakes(scan, found=(CAR,), missed=((VAN, 300),))
-    false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(40.0, -12.0, -1.0)),))
+    false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(-40.0, -12.0, -1.0)),))
     points = replace(
         right, wrong=np.where(np.arange(len(scan)) < 3000, 1, 0).astype(np.uint8), found=(), wrong_share=0.1
     )
@@ -601,6 +623,21 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser:
     assert shown("drivable") == 0
     page.close()
     assert not wrong
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_every_class_has_its_color_in_an_animation(scan: np.ndarray, perception: Perception) -> None:
+    image, tracker = pytest.importorskip("PIL.Image"), Tracker()
+    found = replace(perception.require_points(), classes=("background", "car", "Building"))
+    flat = flatten_scan(scan, replace(perception, points=found))
+    tracks = [tracker.update([replace(CAR, label="Car"), replace(VAN, label="bus")], 0.1 * k) for k in range(4)]
+    with image.open(io.BytesIO(draw_tracks(tracks, under=[flat] * 4))) as animation:
+        animation.seek(3)
+        picture = np.asarray(animation.convert("RGB")).astype(np.int16)
+    walker = picture[334:374, 330:350]  # at x = 12, y = -3
+    assert near(walker, "#7b6152").sum() > 5  # brown, as the picture and the page have it, on a dark panel
+    assert not near(walker, "#dadbdc").any()
+    assert [near(picture[604:, :400], color).sum() > 80 for color in ("car", "#ffffff", "van")] == [True, True, False]
 
 
 @pytest.mark.parametrize("mounting", [MODEL_MOUNTING, Mounting(2.1, 180.0, 3.0, -90.0)])
