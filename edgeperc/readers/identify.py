@@ -178,6 +178,8 @@ def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     if np.isnan(rings).all():
         rings = []
     words = f"{topic} {frame}".lower()
+    if {"tag", "line"} <= {*fields}:  # of Livox' drivers alone
+        raise of_livox()
     source = f"topic {topic}, frame {frame!r}, fields {', '.join(fields)}"
     makers = {maker for maker, pattern in _MAKERS.items() if re.search(pattern, words)}
     if is_ouster_cloud(fields):
