@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
-from ..system.fields import Fields
+from ..system.clock import as_seconds
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import fill_moved, pose_between, poses_of, quaternion
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
-from ..types.points import Floats, Floats32, Points, as_points, read_only
+from ..types.points import Floats, Floats32, Points, as_points, check_each, read_only
 from ..types.rigid import numbers_of, rigid
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
-_OPTIONS = Fields("the motion", OptionError)
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
@@ -60,7 +60,7 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("velocity_mps", "rate_radps"):
-            object.__setattr__(self, name, _OPTIONS.numbers(name, getattr(self, name), 3, -MAX_RATE, MAX_RATE))
+            object.__setattr__(self, name, OPTIONS.numbers(name, getattr(self, name), 3, -MAX_RATE, MAX_RATE))
 
     @classmethod
     def between(cls, T_world_first: ArrayLike, first_s: float, T_world_second: ArrayLike, second_s: float) -> Motion:
@@ -86,6 +86,7 @@ class Motion:
         """
         first = rigid("T_world_first", T_world_first, TrackingError)
         second = rigid("T_world_second", T_world_second, TrackingError)
+        first_s, second_s = as_seconds(first_s, "first_s"), as_seconds(second_s, "second_s")
         if not 0.0 < second_s - first_s < math.inf:
             raise StampError(f"got poses at {first_s} s and {second_s} s; expected a second one that is later")
         if second_s - first_s > LONGEST_S:
@@ -273,6 +274,7 @@ class Trajectory:
     def _around(self, first_s: float, last_s: float) -> tuple[int, int]:
         """The last pose before a scan and the first one after it; errors as `motion`."""
         begin, end = float(self.times_s[0]), float(self.times_s[-1])
+        first_s, last_s = as_seconds(first_s, "the time"), as_seconds(last_s, "the time")
         if not begin - OUTSIDE_S <= first_s <= last_s <= end + OUTSIDE_S:
             raise StampError(
                 f"the poses are of {begin:.3f}..{end:.3f} s, the scan of {first_s:.3f}..{last_s:.3f} s; expected "
@@ -333,10 +335,9 @@ def deskew(
     the exponential of both times the time from ``at_s``. Objects that move themselves stay distorted.
     """
     rows = as_points(points)
-    seen = blank_too_near(rows, _OPTIONS.number("min_range_m", min_range_m, 0.0))
+    seen = blank_too_near(rows, OPTIONS.number("min_range_m", min_range_m, 0.0))
     moments = numbers_of("got times that are not numbers", times, PointsError, f"({len(rows)},) seconds")
-    if moments.shape != (len(rows),):
-        raise PointsError(f"got times of shape {moments.shape}; expected ({len(rows)},), one for each point")
+    check_each(len(rows), times=moments)
     if not isinstance(motion, Motion):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion")
     known = moments[np.isfinite(moments)]
@@ -346,7 +347,7 @@ def deskew(
             f"got times in float32 of {known.max():.6g} s, which it holds to {coarse_s:.2g} s; expected float64, or "
             "seconds since the start of the scan"
         )
-    at = (float(known.max()) if len(known) else 0.0) if at_s is None else at_s
+    at = (float(known.max()) if len(known) else 0.0) if at_s is None else as_seconds(at_s, "at_s")
     if not math.isfinite(at):
         raise StampError(f"at_s is {at_s}; expected finite seconds")
     if len(known) and np.median(np.abs(known - at)) > MAX_ACCUMULATE_S:
@@ -398,15 +399,14 @@ def merge(
         raise PointsError("got no scan; expected at least one")
     if len(poses) != len(rows):
         raise SensorError(f"got {len(poses)} poses for {len(rows)} scans; expected one for each")
-    ranges_m = list(min_range_m) if isinstance(min_range_m, Sequence | np.ndarray) else [min_range_m] * len(rows)
-    if len(ranges_m) != len(rows):
-        raise OptionError(f"got {len(ranges_m)} values of min_range_m for {len(rows)} scans; expected one for each")
+    ranges_m = min_range_m if isinstance(min_range_m, Sequence) or np.ndim(min_range_m) else [min_range_m] * len(rows)
+    ranges_m = OPTIONS.numbers("min_range_m", ranges_m, len(rows), 0.0)
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
     begin = 0
     for k, (scan, given, range_m) in enumerate(zip(rows, poses, ranges_m, strict=True)):
         pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
         R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
-        seen = blank_too_near(scan, _OPTIONS.number("min_range_m", range_m, 0.0))
+        seen = blank_too_near(scan, range_m)
         fill_moved(seen, R, t, merged[begin : begin + len(scan)])
         begin += len(scan)
     return merged

@@ -8,13 +8,15 @@ the gaps that the spacing of the beams explains (`TopView.between_beams`), and n
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from ..errors import OptionError, PointsError
+from ..errors import OptionError
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.geometry import footprints
@@ -185,10 +187,9 @@ def road_ahead(
 
     Raises
     ------
-    PointsError
-        The tolerance is negative or NaN.
     OptionError
-        ``max_corners`` is below 4, or ``top_view`` is none, such as a whole perception.
+        The tolerance is negative or NaN, ``max_corners`` is below 4, or ``top_view`` is none, such as a whole
+        perception. Or a box is not finite, or has no length or width: it would stand nowhere.
 
     Examples
     --------
@@ -197,10 +198,8 @@ def road_ahead(
     >>> road.free_ahead_m(), road.lane_width_m              # doctest: +SKIP
     (31.4, 3.1)
     """
-    if not tolerance_m >= 0.0:
-        raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
-    if not max_corners >= 4:
-        raise OptionError(f"max_corners is {max_corners}; expected at least 4")
+    OPTIONS.number("tolerance_m", tolerance_m, 0.0, math.inf)
+    OPTIONS.whole("max_corners", max_corners, 4, sys.maxsize)
     standing = _standing(top_view, boxes)
     objects = _objects(top_view, standing)
     drivable = np.ascontiguousarray(top_view.drivable & ~objects)
@@ -264,7 +263,7 @@ def free_ahead(top_view: TopView, boxes: Iterable[Box | Track] = (), *, half_wid
     Raises
     ------
     OptionError
-        ``half_width_m`` is negative or NaN, or ``top_view`` is none, such as a whole perception.
+        ``half_width_m`` is negative or NaN; or ``top_view`` or a box is none, as for `road_ahead`.
 
     Examples
     --------
@@ -323,8 +322,7 @@ def _first_m(top_view: TopView, objects: Mask, standing: Sequence[Box]) -> Float
 
 def _strip_ahead(y_m: Floats, firsts: Floats, view_m: float, half_width_m: float) -> FreeAhead:
     """The nearest of each kind within ``half_width_m`` of the axis."""
-    if not half_width_m >= 0.0:
-        raise OptionError(f"half_width_m is {half_width_m}; expected 0 or more meters")
+    OPTIONS.number("half_width_m", half_width_m, 0.0, math.inf)
     near = np.abs(y_m) <= half_width_m
     if not near.any():
         return FreeAhead(math.nan, None, math.inf, math.inf, math.inf, view_m)

@@ -19,6 +19,7 @@ from ..preprocess.health import without_drops
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.clock import nanoseconds_of
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import footprints
@@ -95,7 +96,7 @@ class OccupancyGrid:
         OptionError
             ``off_road`` is out of its range.
         """
-        found = np.full(self.drivable.shape, check_value("off_road", off_road), np.int8)
+        found = np.full(self.drivable.shape, OPTIONS.whole("off_road", off_road, UNKNOWN, OCCUPIED), np.int8)
         found[self.drivable] = FREE
         found[self.obstacle] = OCCUPIED
         found[self.unknown] = UNKNOWN
@@ -167,16 +168,9 @@ class OccupancyGrid:
         return out / "map.yaml"
 
 
-def check_value(name: str, value: int) -> int:
-    """A value of nav_msgs/OccupancyGrid, -1..100. Raises OptionError."""
-    if isinstance(value, bool) or not (isinstance(value, int | np.integer) and UNKNOWN <= value <= OCCUPIED):
-        raise OptionError(f"{name} is {value!r}; expected a whole number from -1 to 100")
-    return int(value)
-
-
 def check_height(min_height_m: float) -> None:
     """Up to where returns are no obstacles. Raises OptionError."""
-    if not 0.0 <= min_height_m < OVERHEAD_M:
+    if not 0.0 <= OPTIONS.number("min_height_m", min_height_m) < OVERHEAD_M:
         raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
 
 
@@ -246,7 +240,7 @@ def occupancy_grid(
     PointsError
         ``points`` is not a scan, or has another number of points than the perceived one.
     OptionError
-        The grid has no cell or too many, or ``min_height_m`` is not from 0 to 2.
+        The grid has no cell or too many, ``min_height_m`` is not from 0 to 2, or a box is none, as for `road_ahead`.
     SensorError
         The sensor is unknown.
 

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError, OptionError, StampError, TrackingError
 from ..system.clock import LATEST_S, Clock
+from ..system.fields import OPTIONS
 from ..tracking import Track
-from ..tracking.moving import MOVABLE, movable_points
+from ..tracking.moving import MOVABLE, as_classes, movable_points
 from ..types.frame import ModelFrame
 from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M
@@ -24,7 +25,7 @@ from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .around import knows_road
-from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, check_value, grid_message, occupancy_grid
+from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, grid_message, occupancy_grid
 
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
@@ -78,18 +79,11 @@ class RollingGrid:
         classes: Collection[str] = MOVABLE,
         margin_m: float = 0.3,
     ) -> None:
-        for name, value, low in (("size_m", size_m, 1.0), ("cell_m", cell_m, 0.01), ("remember_s", remember_s, 0.0)):
-            if not (low <= value < 1e4):
-                raise OptionError(f"{name} is {value}; expected {low:g} or more, and less than 10,000")
-        if not (0.0 <= margin_m < 10.0 and cell_m <= size_m):
-            raise OptionError(
-                f"got margin_m={margin_m}, cell_m={cell_m}, size_m={size_m}; expected cells in the window"
-            )
+        self._cell_m = OPTIONS.number("cell_m", cell_m, 0.01, OPTIONS.number("size_m", size_m, 1.0, 1e4))
+        self._remember_s = OPTIONS.number("remember_s", remember_s, 0.0, 1e4)
+        self._margin_m = OPTIONS.number("margin_m", margin_m, 0.0, 10.0)
         check_height(min_height_m)
-        if isinstance(classes, str):  # its letters would be the classes
-            raise OptionError(f"classes is {classes!r}; expected a collection of names, such as {{{classes!r}}}")
-        self._cell_m, self._remember_s, self._min_height_m = float(cell_m), float(remember_s), min_height_m
-        self._classes, self._margin_m = frozenset(classes), float(margin_m)
+        self._min_height_m, self._classes = min_height_m, as_classes(classes)
         n = round(size_m / cell_m)
         # A scan's own cells lie around the sensor, turned; in their square, the window fits however it is turned.
         reach_m = (math.ceil(n * math.sqrt(0.5)) + 1) * self._cell_m
@@ -266,8 +260,9 @@ class RollingGrid:
         OptionError
             A value is out of its range.
         """
-        found = (UNKNOWN, FREE, check_value("off_road", off_road), OCCUPIED, check_value("unjudged", unjudged))
-        return np.array(found, np.int8)[self._kind]
+        off_road = OPTIONS.whole("off_road", off_road, UNKNOWN, OCCUPIED)
+        unjudged = OPTIONS.whole("unjudged", unjudged, UNKNOWN, OCCUPIED)
+        return np.array((UNKNOWN, FREE, off_road, OCCUPIED, unjudged), np.int8)[self._kind]
 
     def ages_s(self) -> Floats:
         """Time since each cell was last observed, as of the newest scan [s]; infinite where nothing is known.

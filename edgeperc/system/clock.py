@@ -33,7 +33,7 @@ class Stamp(float):
         return Stamp, (float(self), self.ns)
 
 
-def as_seconds(stamp_s: object) -> float:
+def as_seconds(stamp_s: object, name: str = "stamp_s") -> float:
     """A time [s] as a float; raises StampError for a date, a text or whatever else is no number of seconds."""
     if isinstance(stamp_s, float):  # a `Stamp` stays one
         return stamp_s
@@ -44,7 +44,7 @@ def as_seconds(stamp_s: object) -> float:
         return float(stamp_s)
     except (OverflowError, TypeError, ValueError):
         raise StampError(
-            f"stamp_s is {stamp_s!r:.80}, a {type(stamp_s).__name__}; expected the time of the scan [s]"
+            f"{name} is {stamp_s!r:.80}, a {type(stamp_s).__name__}; expected the time of the scan [s]"
         ) from None
 
 

@@ -8,8 +8,11 @@ import math
 import reprlib
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from numbers import Integral
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from ..errors import OptionError
 
 T = TypeVar("T")
 MAX_NUMBER = 1e300
@@ -58,9 +61,9 @@ class Fields:
 
     def whole(self, name: str, value: Any, low: int, high: int) -> int:
         """A whole number from ``low`` to ``high``."""
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
             self.refuse(name, value, f"a whole number from {low} to {high}")
-        return value
+        return int(value)
 
     def numbers(
         self, name: str, values: Any, n: int | None = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
@@ -131,6 +134,9 @@ class Fields:
             )
         prefix = f"{name}." if name else ""
         return kind(**{key: self.entry(kinds[key], value[key], prefix + key) for key in kinds if key in value})
+
+
+OPTIONS = Fields("the options", OptionError)  # of what callers pass
 
 
 @functools.cache

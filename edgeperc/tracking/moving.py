@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.choices import VEHICLES
 from ..types.perception import Box, Perception, scan_of
@@ -27,6 +28,13 @@ MOVABLE = frozenset(
 """Classes of points and boxes that can move on their own or are moved by people."""
 
 
+def as_classes(names: Collection[str]) -> frozenset[str]:
+    """Names of classes; OptionError for a single name, whose letters or parts would be the classes."""
+    if isinstance(names, str | bytes) or not isinstance(names, Iterable):
+        raise OptionError(f"classes is {names!r}; expected a collection of names, such as {{{names!r}}}")
+    return frozenset(names)
+
+
 def moving_tracks(
     tracks: Iterable[Track], *, min_speed_mps: float | None = None, n_sigmas: float = 3.0
 ) -> tuple[Track, ...]:
@@ -35,9 +43,8 @@ def moving_tracks(
 
     A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
     """
-    for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
-        if value is not None and not 0.0 <= value < math.inf:
-            raise OptionError(f"{name} is {value}; expected 0 or more")
+    for name, value in (("min_speed_mps", min_speed_mps or 0.0), ("n_sigmas", n_sigmas)):
+        OPTIONS.number(name, value, 0.0)
     found = []
     for track in tracks:
         slowest = PARAMETERS.get(track.label, PARAMETERS["car"]).moving_mps if min_speed_mps is None else min_speed_mps
@@ -108,11 +115,11 @@ def movable_points(
     Raises
     ------
     OptionError
-        ``margin_m`` is negative or not finite.
+        ``margin_m`` is negative or not finite, or ``classes`` is a single name.
     PointsError
         ``points`` is not the scan of the perception.
     """
-    scan = scan_of(perception, points)
+    scan, classes = scan_of(perception, points), as_classes(classes)
     found = _inside_any([box for box in perception.boxes if box.label in classes], scan, margin_m)
     if perception.points is not None:
         numbers = [k for k, name in enumerate(perception.points.classes) if name in classes]
@@ -121,8 +128,7 @@ def movable_points(
 
 
 def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
-    if not 0.0 <= margin_m < math.inf:
-        raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
+    OPTIONS.number("margin_m", margin_m, 0.0)
     rows = [
         (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
         for box in boxes

@@ -7,6 +7,7 @@ the latter case, `edgeperc.tracking.egomotion` estimates the sensor's motion.
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
 from ..system.clock import GAP_S, LATEST_S, Clock, Step, as_seconds
+from ..system.fields import OPTIONS
 from ..types.frame import model_rotation
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
@@ -117,9 +119,7 @@ class Tracker:
         given = {} if parameters is None else parameters
         if not isinstance(given, Mapping) or not all(isinstance(of, ClassParameters) for of in given.values()):
             raise OptionError(f"parameters is {parameters!r:.200}; expected ClassParameters by class, or None")
-        if not isinstance(max_tracks, int | np.integer) or max_tracks < 0:
-            raise OptionError(f"max_tracks is {max_tracks!r}; expected a whole number, 0 or more")
-        self._max_tracks = int(max_tracks)
+        self._max_tracks = OPTIONS.whole("max_tracks", max_tracks, 0, sys.maxsize)
         self._clock = Clock()
         self.reset()
         # Compile every kernel here, not in the first updates: a track begins, and is found again.
@@ -473,11 +473,8 @@ def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -
 
 def _checked_view(field_of_view_deg: tuple[float, float]) -> tuple[float, float]:
     """Azimuth of the right edge, and the width [rad]."""
-    try:
-        left, right = map(float, field_of_view_deg)
-    except (TypeError, ValueError):
-        left = right = math.nan
-    if not 0.0 < left - right < math.inf:
+    left, right = OPTIONS.pair("field_of_view_deg", field_of_view_deg)
+    if not left > right:
         raise OptionError(
             f"field_of_view_deg is {field_of_view_deg!r}; expected the azimuths of the left and the right edge, the "
             "left one higher: (40, -40) looks ahead, (220, 140) back"

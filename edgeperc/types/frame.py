@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import OptionError
 from ..system.kernels import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
@@ -30,7 +31,7 @@ class ModelFrame:
     Parameters
     ----------
     mounting : Mounting
-        A known one.
+        Of a known height, such as that of a perception, otherwise OptionError. Unknown angles count as 0.
 
     Attributes
     ----------
@@ -44,7 +45,8 @@ class ModelFrame:
     """
 
     def __init__(self, mounting: Mounting) -> None:
-        assert mounting.height_m is not None
+        if not isinstance(mounting, Mounting) or mounting.height_m is None:
+            raise OptionError(f"mounting is {mounting!r:.200}; expected one with a height_m, as a perception has it")
         self.R: Floats = model_rotation(mounting)
         raised = MODEL_MOUNTING.rotation().T @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
         self.eye: Floats = raised

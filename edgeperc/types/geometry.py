@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 from ..system.kernels import njit
 from .perception import Box
 from .points import Floats, Ints64, Labels, Mask, Records, read_only
@@ -67,7 +67,10 @@ def draw_footprints(labels: Labels, boxes: Iterable[Box], view: TopViewGeometry,
 
 
 def footprints(boxes: Sequence[Box], view: TopViewGeometry) -> Mask:
-    """Cells of a top view whose centers lie in the footprint of a box, (rows, columns) bool."""
+    """Cells, (rows, columns) bool, with their centers in the footprint of a box. OptionError without one."""
+    for box in boxes:
+        if not (min(box.size[:2]) > 0.0 and math.isfinite(math.hypot(*box.center[:2], *box.size[:2], box.yaw))):
+            raise OptionError(f"got {box}; expected finite numbers, and a length and a width: drop such boxes first")
     drawn = np.zeros((view.height, view.width), np.uint8)
     fill_footprints(box_records(boxes, [1] * len(boxes)), grid_of(view), drawn)
     return drawn.view(np.bool_)

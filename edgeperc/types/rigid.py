@@ -13,10 +13,13 @@ ROW_TOLERANCE = 1e-6  # of the last row: what is multiplied or inverted in float
 
 
 def numbers_of(what: str, given: ArrayLike, error: type[EdgepercError], expected: str) -> NDArray[np.float64]:
-    """A C-contiguous copy of numbers that a caller passes; otherwise an error of this type, which begins with this."""
+    """A C-contiguous copy of a caller's numbers; else, as for masked ones, dates and texts, an error that begins so."""
     try:
-        return np.array(given, np.float64, order="C")
-    except (OverflowError, TypeError, ValueError) as exc:
+        values = np.asarray(given)
+        if isinstance(given, np.ma.MaskedArray) or values.dtype.kind not in "fiubO":
+            raise TypeError(f"a {type(given).__name__} of {values.dtype}")
+        return np.array(values, np.float64, order="C")
+    except (OverflowError, RuntimeError, TypeError, ValueError) as exc:
         raise error(f"{what} ({exc}); expected {expected}") from exc
 
 

@@ -274,14 +274,13 @@ class SensorProfile:
         SensorError
             The values do not describe a possible sensor.
         """
-        if isinstance(n_beams, bool) or not isinstance(n_beams, int | np.integer) or not 1 <= n_beams <= 4096:
-            raise SensorError(f"sensor {name!r}: n_beams is a whole number in 1..4096, got {n_beams!r}")
-        if not math.isfinite(fov_up_deg) or not math.isfinite(fov_down_deg):
-            raise SensorError(f"sensor {name!r}: fov_up_deg and fov_down_deg must be finite")
+        up = FIELDS.number(f"sensor {name!r}: fov_up_deg", fov_up_deg, -90.0, 90.0)
+        down = FIELDS.number(f"sensor {name!r}: fov_down_deg", fov_down_deg, -90.0, 90.0)
+        n_beams = FIELDS.whole(f"sensor {name!r}: n_beams", n_beams, 1, 4096)
         return cls(
             name,
             # Rounded: a card then holds 2.3 and not 2.3000000000000003.
-            tuple(round(float(e), 4) for e in np.linspace(fov_up_deg, fov_down_deg, int(n_beams))),
+            tuple(round(float(e), 4) for e in np.linspace(up, down, n_beams)),
             columns,
             remission_range,
             mounting,

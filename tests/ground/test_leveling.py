@@ -187,6 +187,9 @@ def test_scans_of_the_training_vehicle_are_not_moved(scans: list[NDArray[np.floa
     frame = ModelFrame(MODEL_MOUNTING)
     assert frame.is_identity
     assert frame.move(scans[0]) is scans[0]
+    for unknown in (Mounting(), None):
+        with pytest.raises(OptionError, match=r"mounting is .*; expected one with a height_m"):
+            ModelFrame(unknown)  # type: ignore[arg-type]
 
 
 @given(mountings, st.integers(0, 2**32 - 1))

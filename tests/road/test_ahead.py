@@ -17,7 +17,7 @@ from shapely import Point, Polygon
 
 import twins.ahead
 import twins.outline
-from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, Tracker, read_points
+from edgeperc import Box, OptionError, Perceiver, TopView, Tracker, read_points
 from edgeperc.road.ahead import fill_corridor, fill_first_cells, free_ahead, road_ahead
 from edgeperc.road.outline import resolve_contacts
 from edgeperc.types.frame import ModelFrame
@@ -308,14 +308,18 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
     road = road_ahead(view(~blank()))
     with pytest.raises(dataclasses.FrozenInstanceError):
         road.lane_width_m = 3.0  # type: ignore[misc]
-    for tolerance_m in (-0.1, math.nan):
-        with pytest.raises(PointsError, match=f"tolerance_m is {tolerance_m}; expected 0 or more"):
+    for tolerance_m in (-0.1, math.nan, "a", None):
+        with pytest.raises(OptionError, match=f"tolerance_m is {tolerance_m!r}; expected a number from 0"):
             road_ahead(view(blank()), tolerance_m=tolerance_m)
-    for half_width_m in (-0.1, math.nan):
-        with pytest.raises(OptionError, match=f"half_width_m is {half_width_m}; expected 0 or more"):
+    for half_width_m in (-0.1, math.nan, "a", None):
+        with pytest.raises(OptionError, match=f"half_width_m is {half_width_m!r}; expected a number from 0"):
             free_ahead(view(blank()), half_width_m=half_width_m)
-    with pytest.raises(OptionError, match="max_corners is 3; expected at least 4"):
+    with pytest.raises(OptionError, match="max_corners is 3; expected a whole number from 4"):
         road_ahead(view(blank()), max_corners=3)
+    for center, size in (((math.nan, 0, 0), (4, 2, 1)), ((10, 0, 0), (math.inf, 2, 1)), ((10, 0, 0), (4, -2, 1))):
+        for measure in (road_ahead, free_ahead):  # the road would be free there
+            with pytest.raises(OptionError, match="expected finite numbers, and a length and a width"):
+                measure(view(~blank()), [Box("car", 0.9, center, size, 0.0)])
     for measure in (road_ahead, free_ahead):
         with pytest.raises(OptionError, match=r"got a NoneType for top_view; pass perception.require_top_view\(\)"):
             measure(None)

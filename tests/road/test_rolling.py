@@ -240,10 +240,11 @@ def test_the_largest_float_of_what_did_not_return_is_no_warning() -> None:
         ({"size_m": 0.0}, "size_m is 0"),
         ({"cell_m": math.nan}, "cell_m is nan"),
         ({"remember_s": -1.0}, "remember_s is -1"),
-        ({"margin_m": -0.1}, "margin_m=-0.1"),
+        ({"margin_m": -0.1}, "margin_m is -0.1"),
+        ({"classes": None}, "expected a collection of names"),
         ({"min_height_m": 2.0}, "min_height_m is 2"),
         ({"classes": "car"}, "expected a collection of names, such as {'car'}"),
-        ({"size_m": 2.0, "cell_m": 3.0}, "cells in the window"),
+        ({"size_m": 2.0, "cell_m": 3.0}, "cell_m is 3.0; expected a number from 0.01 to 2"),
         ({"size_m": 9e3, "cell_m": 0.01}, "no grid"),
     ],
 )

@@ -116,10 +116,12 @@ def test_what_could_move_is_marked_by_class_and_by_box() -> None:
 
 def test_errors_name_the_reason() -> None:
     tracks, points = followed(lambda t: (9.0, 0.0)), np.zeros((3, 4), np.float32)
-    for options in ({"margin_m": -1.0}, {"margin_m": math.nan}, {"n_sigmas": math.inf}, {"min_speed_mps": -0.1}):
+    for options in ({"margin_m": -1.0}, {"margin_m": math.nan}, {"n_sigmas": math.inf}, {"min_speed_mps": "a"}):
         with pytest.raises(OptionError, match=f"{next(iter(options))} is "):
             moving_points(tracks, points, **options)
     with pytest.raises(PointsError, match="expected"):
         moving_points(tracks, np.zeros((3, 2)))
+    with pytest.raises(OptionError, match="classes is 'cars'"):  # which has car in it
+        movable_points(perceived(3), points, classes="cars")
     with pytest.raises(PointsError, match="3 points and a perception of 4"):
         movable_points(perceived(4), points)
