@@ -9,15 +9,13 @@ from typing import Any, overload
 
 import numpy as np
 
-from ..errors import OptionError
-from ..system.fields import Fields
+from ..system.fields import OPTIONS
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Records
 from .lives import MOVED
 from .ukf import MODES
 
-_FIELDS = Fields("parameters", OptionError)
 # Lowest and highest value of those that may be 0 or below, and of shares: tracks would be lost without a word.
 _BOUNDS = {
     **dict.fromkeys(("birth_score", "sure_score", "latest"), (0.0, 1.0)),
@@ -71,9 +69,9 @@ class ClassParameters:
         for each in fields(self):
             value, bounds = getattr(self, each.name), _BOUNDS.get(each.name, (1e-6, 1e6))
             if each.name == "shape_m":
-                _FIELDS.numbers(each.name, value, 4, *bounds)
+                OPTIONS.numbers(each.name, value, 4, *bounds)
             elif each.name != "group":
-                _FIELDS.number(each.name, value, *bounds)
+                OPTIONS.number(each.name, value, *bounds)
 
 
 # The weights of scores were chosen on ten KITTI sequences. Only far_logit was fixed on one half and confirmed on the
@@ -230,6 +228,7 @@ class Tracks(Sequence[Track]):
     __slots__ = (
         "T_world_sensor",
         "_labels",
+        "_made",
         "_rows",
         "_world",
         "boxes",
@@ -257,6 +256,7 @@ class Tracks(Sequence[Track]):
         is_late: bool = False,
     ) -> None:
         self._rows, self._labels = rows, labels
+        self._made: list[Track | None] = [None] * len(rows)  # the same object each time, so that `in` finds a track
         self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
         self.n_tentative, self.n_approximated = n_tentative, n_approximated
         self.session, self.is_late = session, is_late
@@ -289,6 +289,11 @@ class Tracks(Sequence[Track]):
     def __getitem__(self, index: int | slice) -> Track | list[Track]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
+        track = self._made[index] = self._made[index] or self._track(index)
+        return track
+
+    def _track(self, index: int) -> Track:
         row = self._rows[index]
         label, score = self._labels[row["label"]], float(self.scores[index])
         front = None if math.isnan(self.fronts[index]) else float(self.fronts[index])

@@ -493,6 +493,7 @@ def test_a_tracker_takes_perceptions() -> None:
     tracks = tracker(perception(1.1))
     assert tracks[0].label == tracks[-1].label == "car"
     assert [track.id for track in tracks[:1]] == [1]
+    assert all(track in tracks and tracks.index(track) == k for k, track in enumerate(tracks))
     assert tracks.stamp_s == 1.1
     assert sum(tracks[0].modes.values()) == pytest.approx(1.0)
     with pytest.raises(StampError, match="no stamp_s"):
