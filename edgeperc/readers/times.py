@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError, StampError
-from ..types.points import Floats, Mask, Points
+from ..system.clock import as_seconds
+from ..system.fields import OPTIONS
+from ..types.points import Floats, Mask, Points, as_points, check_each
+from ..types.rigid import numbers_of
 from ..types.sensor import MAX_ACCUMULATE_S, MIN_ACCUMULATE_S
 
 if TYPE_CHECKING:
@@ -211,17 +214,16 @@ def accumulate(
 
     Raises
     ------
+    PointsError
+        A scan is not points, or has not one time for each of them.
     StampError
-        A scan has neither times nor a stamp, or no pose of a trajectory is near its times.
+        A scan has neither times nor a finite stamp, or no pose of a trajectory is near its times.
     OptionError
         ``accumulate_s`` is not 0.01 to 10 s, or ``motion`` is neither.
     """
     from ..preprocess.motion import Motion, Trajectory, deskew  # numba, which bags do without
 
-    if not (isinstance(accumulate_s, int | float) and MIN_ACCUMULATE_S <= accumulate_s <= MAX_ACCUMULATE_S):
-        raise OptionError(
-            f"accumulate_s is {accumulate_s!r:.80}; expected {MIN_ACCUMULATE_S} to {MAX_ACCUMULATE_S:g} s"
-        )
+    OPTIONS.number("accumulate_s", accumulate_s, MIN_ACCUMULATE_S, MAX_ACCUMULATE_S)
     if not isinstance(motion, Motion | Trajectory | None):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion, a Trajectory or None")
 
@@ -238,13 +240,19 @@ def accumulate(
     begin_s = end_s = 0.0
     last: float | None = None
     is_waiting = False
-    for stamp_s, points, times_s in scans:
+    for scan in scans:
+        if not isinstance(scan, tuple) or len(scan) != 3:
+            raise PointsError(f"got a {type(scan).__name__}; expected each scan as edgeperc.TimedScan")
+        stamp_s, points, times_s = scan
         if times_s is None:
-            if stamp_s is None:
+            if stamp_s is None or not np.isfinite(as_seconds(stamp_s)):
                 raise StampError(
-                    "a scan has neither times of its points nor a stamp; expected one of them to gather by"
+                    f"a scan has neither times of its points nor a stamp ({stamp_s}); expected one of them"
                 )
             times_s = np.full(len(points), stamp_s)
+        points = as_points(points)
+        times_s = numbers_of("got times that are not numbers", times_s, PointsError, "seconds")
+        check_each(len(points), times_s=times_s)
         if not np.isfinite(times_s).any():
             continue
         first_s, newest_s = float(np.nanmin(times_s)), float(np.nanmax(times_s))

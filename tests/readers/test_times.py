@@ -535,8 +535,13 @@ def test_what_cannot_be_gathered() -> None:
     scan = TimedScan(None, np.ones((3, 4), np.float32), None)
     with pytest.raises(StampError, match="neither times of its points nor a stamp"):
         next(accumulate([scan], 0.5))
-    for value in (0.0, -1.0, 11.0, math.nan, "1"):
-        with pytest.raises(OptionError, match=r"accumulate_s is .*expected 0.01 to 10 s"):
+    with pytest.raises(StampError, match=r"nor a stamp \(nan\)"):  # it would be left out, and all of such a source
+        next(accumulate([TimedScan(math.nan, np.ones((3, 4), np.float32), None)], np.float32(0.5)))
+    for wrong in (TimedScan(0.0, np.ones((3, 4), np.float32), np.zeros(2)), (0.0, np.ones((3, 4), np.float32))):
+        with pytest.raises(PointsError, match=r"one value a point|expected each scan as edgeperc.TimedScan"):
+            next(accumulate([wrong], 0.5))  # type: ignore[list-item]
+    for value in (0.0, -1.0, 11.0, math.nan, "1", True):
+        with pytest.raises(OptionError, match=r"accumulate_s is .*expected a number from 0.01 to 10"):
             next(accumulate([scan], value))  # type: ignore[arg-type]
     for motion in ((1.0, 0.0, 0.0), np.eye(4), "poses.txt"):
         with pytest.raises(OptionError, match=r"(?s)motion is .*expected a Motion, a Trajectory or None"):
