@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import CalibrationError, PointsError
+from ..errors import CalibrationError
+from ..system.fields import Fields
 from ..system.kernels import njit
 from ..types.points import Floats, Points, by_axes, read_only
 from ..types.rigid import ROW_TOLERANCE, numbers_of, rigid
 
+_FIELDS = Fields("the calibration", CalibrationError)
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
 MAX_OFF_CENTER = 0.1  # of the image, in both directions: the lenses of KITTI, nuScenes and Waymo are off by 0.06 in one
@@ -64,8 +66,8 @@ class Calibration:
         K[2] = 0.0, 0.0, 1.0
         object.__setattr__(self, "K", read_only(K, np.float64))
         object.__setattr__(self, "T_camera_sensor", read_only(T, np.float64))
-        object.__setattr__(self, "width", _pixels("width", self.width))
-        object.__setattr__(self, "height", _pixels("height", self.height))
+        object.__setattr__(self, "width", _FIELDS.whole("width", self.width, 1, MAX_EDGE))
+        object.__setattr__(self, "height", _FIELDS.whole("height", self.height, 1, MAX_EDGE))
         if self.width * self.height > MAX_PIXELS:
             raise CalibrationError(f"width x height is {self.width} x {self.height}; expected at most {MAX_PIXELS:,}")
         c_x, c_y = K[:2, 2].tolist()
@@ -108,7 +110,8 @@ class Calibration:
 
     def resized(self, width: int, height: int) -> Calibration:
         """The calibration of the same image, resized to ``width`` x ``height`` [px] without a crop."""
-        scale = np.diag([_pixels("width", width) / self.width, _pixels("height", height) / self.height, 1.0])
+        new = [_FIELDS.whole(name, n, 1, MAX_EDGE) for name, n in (("width", width), ("height", height))]
+        scale = np.diag([new[0] / self.width, new[1] / self.height, 1.0])
         half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from centers of pixels to their edges
         return Calibration(np.linalg.inv(half) @ scale @ half @ self.K, self.T_camera_sensor, width, height)
 
@@ -131,14 +134,9 @@ class Calibration:
         Raises
         ------
         PointsError
-            ``points`` has another shape.
+            ``points`` has another shape, or a table lacks x, y or z.
         """
-        try:
-            rows = read_only(by_axes(points))
-        except (TypeError, ValueError) as exc:
-            raise PointsError(f"got points that are not an array of numbers ({exc}); expected (n, 3 or more)") from exc
-        if rows.ndim != 2 or rows.shape[1] < 3:
-            raise PointsError(f"got points of shape {rows.shape}; expected (n, 3 or more): x, y, z")
+        rows = read_only(by_axes(points))
         u, v, depth = np.empty((3, len(rows)))
         fill_projected(rows, self.K @ self.T_camera_sensor[:3], u, v, depth)
         return u, v, depth
@@ -233,12 +231,6 @@ def warn_off_center(K: Floats, width: int, height: int, advice: str) -> None:
             f"{height} pixels; expected K, or P2, of this image: {advice}",
             stacklevel=4,
         )
-
-
-def _pixels(name: str, given: object) -> int:
-    if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 1 <= given <= MAX_EDGE:
-        raise CalibrationError(f"{name} is {given!r:.80}; expected a whole number of pixels from 1 to {MAX_EDGE}")
-    return int(given)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

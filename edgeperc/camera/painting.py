@@ -13,16 +13,16 @@ import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..errors import CalibrationError, ImageError, OptionError, PointsError
+from ..errors import CalibrationError, ImageError, OptionError
 from ..ground.planes import fit_ground, heights_above
 from ..preprocess.returns import returns
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import ImageLabels, Perception, TopView, sensor_behind
-from ..types.points import Bytes, Floats, Floats32, Labels, Mask, Points, read_only
+from ..types.points import Bytes, Floats, Floats32, Labels, Mask, Points, by_axes, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 from .calibration import Calibration
@@ -69,7 +69,7 @@ class DepthBuffer(NamedTuple):
 
 def paint(
     image: Perception | ImageLabels | Bytes,
-    points: Points,
+    points: ArrayLike,
     calibration: Calibration,
     *,
     sensor: str | os.PathLike[str] | SensorProfile | None = None,
@@ -81,8 +81,8 @@ def paint(
     ----------
     image : Perception, ImageLabels or (H, W) uint8
         Classes of the image's pixels, at the size that the calibration is for. 255 means no class.
-    points : (n, 3 or more) float32
-        x, y, z [m] in the frame of the sensor, taken at the time of the image.
+    points : (n, 3 or more) array_like, or a table
+        x, y, z [m] in the frame of the sensor, taken at the time of the image; those of a table by their names.
     calibration : Calibration
     sensor : str, Path or SensorProfile, optional
         The spacing of its beams and columns sets the size of the windows. By default that of the perception or, without
@@ -135,7 +135,7 @@ def paint(
 
 def camera_road(
     image: Perception | ImageLabels | Mask,
-    points: Points,
+    points: ArrayLike,
     calibration: Calibration,
     *,
     sensor: str | os.PathLike[str] | SensorProfile | None = None,
@@ -151,8 +151,8 @@ def camera_road(
     ----------
     image : Perception, ImageLabels or (H, W) bool
         The pixels that are road (`ImageLabels.drivable`), at the size that the calibration is for.
-    points : (n, 3 or more) float32
-        x, y, z [m] in the frame of the sensor, taken at the time of the image.
+    points : (n, 3 or more) array_like, or a table
+        x, y, z [m] in the frame of the sensor, taken at the time of the image; those of a table by their names.
     calibration : Calibration
     sensor, mounting
         As for `paint`. The cells lie in the frame of the models (`TopView`), into which the mounting moves the scan.
@@ -208,26 +208,25 @@ def _mounting_of(image: object, mounting: Mounting | None) -> Mounting:
 
 def _hidden_by(
     image: object,
-    points: Points,
+    points: ArrayLike,
     calibration: Calibration,
     sensor: str | os.PathLike[str] | SensorProfile | None,
     mounting: Mounting | None,
     places: Floats = _NOWHERE,
 ) -> tuple[Floats32, DepthBuffer, Floats]:
     """The points, the depth buffer of those above the ground, and ``places`` on the ground, NaN without ground."""
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
-        raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
+    xyz = by_axes(points)[:, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         known = _mounting_of(image, mounting)
-        scan = np.zeros((len(points), 4), np.float32)
-        scan[:, :3] = points[:, :3]
+        scan = np.zeros((len(xyz), 4), np.float32)
+        scan[:, :3] = xyz
         profile = sensor_behind(image, sensor)
         rows, _ = returns(scan, profile, known.origin_m)
         frame = ModelFrame(known)
         _check_upright(calibration.T_camera_sensor[:3, :3], frame.R[2])
         above = (rows[:, :3].astype(np.float64) @ frame.R.T + frame.t).astype(np.float32)
         surface = None
-        if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(points), known):
+        if isinstance(image, Perception) and (image.n_points, image.mounting) == (len(xyz), known):
             surface = image.ground
         surface = surface or fit_ground(above, mount_height_m=MODEL_HEIGHT_M, any_order=True).surface()
         is_ground = heights_above(surface, above).mask
@@ -250,7 +249,7 @@ def _labels_of(image: object, dtype: type, calibration: Calibration) -> NDArray[
     """Pixels of an image's labels, checked."""
     if not isinstance(calibration, Calibration):
         raise CalibrationError(f"got {_described(calibration)} for the calibration; expected an edgeperc.Calibration")
-    if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != dtype:
+    if not isinstance(image, np.ndarray) or np.ma.isMA(image) or image.ndim != 2 or image.dtype != dtype:
         raise ImageError(
             f"got {_described(image)} for the image; expected a perception with an image, its ImageLabels, or an "
             f"array (H, W) of {np.dtype(dtype)}"

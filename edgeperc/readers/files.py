@@ -23,10 +23,10 @@ from ..types.points import (
     as_float64,
     as_points,
     assemble,
+    columns_of,
     is_remission_name,
     plain_name,
     remission_name,
-    table_columns,
 )
 from .inflate import inflate, most_bytes
 from .origin import find_place
@@ -91,9 +91,7 @@ def read_points(
     options = FileOptions(columns, remission_field, origin_m)
     if isinstance(source, str | os.PathLike):
         return _read(Path(source), options).points
-    if isinstance(origin_m, str):
-        return _of_array(np.asarray(source), options).points
-    return as_points(source, remission_field=remission_field, origin_m=origin_m)
+    return _of_array(source, options).points
 
 
 def find_origin(
@@ -120,8 +118,7 @@ def find_origin(
         As `read_points`, or the place cannot be told.
     """
     options = FileOptions(columns, None, "auto")
-    is_file = isinstance(source, str | os.PathLike)
-    read = _read(Path(source), options) if is_file else _of_array(np.asarray(source), options)  # type: ignore[arg-type]
+    read = _read(Path(source), options) if isinstance(source, str | os.PathLike) else _of_array(source, options)
     assert read.origin_m is not None
     x, y, z = read.origin_m
     return x, y, z
@@ -297,12 +294,12 @@ def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
     return _of_values(Columns(len(array), dict(zip(names, array.T, strict=True)), names), options)
 
 
-def _of_array(array: NDArray[Any], options: FileOptions) -> _Read:
-    fields = table_columns(array)
+def _of_array(given: ArrayLike, options: FileOptions) -> _Read:
+    fields, array = columns_of(given)
     options = options if fields else _unnamed(options, array.shape[1] if array.ndim == 2 else 4)
     xyz = fields if fields or array.ndim != 2 else dict(zip("xyz", array.T, strict=False))
     origin = _origin(xyz, options)
-    return _Read(as_points(array, remission_field=options.remission_field, origin_m=origin), fields, origin)
+    return _Read(as_points(given, remission_field=options.remission_field, origin_m=origin), fields, origin)
 
 
 def _of_columns(columns: Columns, options: FileOptions) -> _Read:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import OptionError, PointsError
+from ..errors import OptionError
 from ..system.clock import elapsed_s
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.perception import Box
 from ..types.points import Floats, Mask, by_axes, read_only
@@ -70,13 +71,11 @@ class Zone:
         Raises
         ------
         PointsError
-            The points have another shape.
+            The points have another shape, or a table lacks x or y.
         """
-        rows = numbers_of("got points that are not numbers", by_axes(points), PointsError, "(n, 2 or more)")
-        if rows.ndim != 2 or rows.shape[1] < 2:
-            raise PointsError(f"got points of shape {rows.shape}; expected (n, 2 or more): x, y")
+        rows = read_only(by_axes(points, "xy")[:, :2], np.float64)
         inside = np.empty(len(rows), np.bool_)
-        mark_inside(self.polygon, read_only(rows[:, :2], np.float64), inside)
+        mark_inside(self.polygon, rows, inside)
         return inside
 
     def boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
@@ -159,9 +158,7 @@ class Line:
         self.start, self.end = (_places("a line", [place])[0] for place in (start, end))
         if not math.dist(self.start, self.end) > 0.0:
             raise OptionError(f"a line from {self.start.tolist()} to itself; expected two places")
-        if not 0.0 <= margin_m < math.inf:
-            raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
-        self.margin_m, self.world = float(margin_m), world
+        self.margin_m, self.world = OPTIONS.number("margin_m", margin_m, 0.0), world
         self.to_left = self.to_right = 0
         # The time that has passed so far without jumps of the clock, and the stamp of the last scan.
         self._now_s, self._stamp_s = 0.0, math.inf

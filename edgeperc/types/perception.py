@@ -449,9 +449,9 @@ class Perception:
         Raises
         ------
         PointsError
-            The place of the scan in a map was not given.
+            The place of the scan in a map was not given, or ``points`` are none.
         """
-        return np.asarray(by_axes(points))[:, :3].astype(np.float64) + np.array(self._origin())
+        return by_axes(points)[:, :3].astype(np.float64) + np.array(self._origin())
 
     @property
     def map_boxes(self) -> tuple[Box, ...]:

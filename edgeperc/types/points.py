@@ -64,20 +64,11 @@ def as_points(
     origin_m : subtracted from x, y, z [m] before they become float32. Raises PointsError: Also for coordinates of a
         map, which float32 would round by more than 5 mm.
     """
-    if isinstance(array, np.ma.MaskedArray):
-        raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
-    if not isinstance(array, np.ndarray) and (what := _to_convert(array)):
-        raise PointsError(f"got {what[0]}; expected (n, 4) x, y, z, remission: pass {what[1]}")
-    try:
-        # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
-        named = {} if isinstance(array, np.ndarray) else _frame_columns(array)
-        values = np.asarray(array)
-    except Exception as exc:
-        raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
+    named, values = columns_of(array)
+    if values.dtype.names is not None:
+        return assemble(values.size, named, values.dtype.names, remission_field, origin_m)
     if named:
         return assemble(len(values), named, [*named], remission_field, origin_m)
-    if values.dtype.names is not None:
-        return assemble(values.size, table_columns(values), values.dtype.names, remission_field, origin_m)
     if values.dtype.kind not in "fiu":
         raise PointsError(f"got an array of {values.dtype}; expected (n, 4) numbers: x, y, z, remission")
     if values.ndim != 2 or values.shape[1] not in (3, 4):
@@ -92,6 +83,21 @@ def as_points(
         return assemble(len(values), columns, [*columns], None, origin_m)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
+
+
+def columns_of(given: ArrayLike) -> tuple[dict[str, NDArray[Any]], NDArray[Any]]:
+    """The numeric columns by `plain_name` of what has named ones, and all as an array; PointsError for what is none."""
+    if isinstance(given, np.ma.MaskedArray):
+        raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
+    if not isinstance(given, np.ndarray) and (what := _to_convert(given)):
+        raise PointsError(f"got {what[0]}; expected (n, 4) x, y, z, remission: pass {what[1]}")
+    try:
+        # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
+        named = {} if isinstance(given, np.ndarray) else _frame_columns(given)
+        values = np.asarray(given)
+    except Exception as exc:
+        raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
+    return named or table_columns(values), values
 
 
 def _frame_columns(thing: Any) -> dict[str, NDArray[Any]]:
@@ -150,11 +156,14 @@ def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return _numeric((name, table[name].reshape(-1)) for name in table.dtype.names or ())
 
 
-def by_axes(points: ArrayLike) -> ArrayLike:
-    """x, y and z of a table, a data frame or a structured array, whatever the order of its columns; else as given."""
-    columns = _frame_columns(points) if not isinstance(points, np.ndarray) else table_columns(points)
-    axes = [columns[axis] for axis in "xyz" if axis in columns]
-    return np.column_stack(axes) if axes else points
+def by_axes(points: ArrayLike, axes: str = "xyz") -> NDArray[Any]:
+    """These columns of what has named ones, whatever their order; else the array. PointsError for what is no points."""
+    columns, values = columns_of(points)
+    is_plain = values.dtype.kind in "fiu" and values.ndim == 2 and values.shape[1] >= len(axes)
+    if not ({*axes} <= columns.keys() if columns else is_plain):
+        what = f"columns {', '.join(columns)}" if columns else f"shape {values.shape} and type {values.dtype}"
+        raise PointsError(f"got points of {what}; expected (n, {len(axes)} or more) numbers: {', '.join(axes)}")
+    return np.column_stack([columns[axis] for axis in axes]) if columns else values
 
 
 def _numeric(fields: Iterable[tuple[Any, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

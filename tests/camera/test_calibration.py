@@ -120,9 +120,11 @@ def test_projection_equals_twin(seed: int, n: int) -> None:
     assert np.isnan(depth).tolist() == (~np.isfinite(points[:, :3]).all(axis=1)).tolist()
 
 
-@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((4, 2)), "points", [[1.0], [2.0, 3.0]], None])
+@pytest.mark.parametrize(
+    "points", [np.zeros(3), np.zeros((4, 2)), "points", [[1.0], [2.0, 3.0]], None, np.ma.masked_all((4, 3))]
+)
 def test_what_are_no_points_is_refused(points: object) -> None:
-    with pytest.raises(PointsError, match=r"expected \(n, 3 or more\)"):
+    with pytest.raises(PointsError, match=r"expected \(n, [34]|got a masked array"):
         Calibration(K, AHEAD, 640, 480).project(points)  # type: ignore[arg-type]
 
 

@@ -337,10 +337,12 @@ def test_what_does_not_fit_is_refused() -> None:
         paint(labels, points, NEAR.resized(320, 240))
     with pytest.raises(ImageError, match="got NoneType for the image"):
         paint(replace(perceived(scan, image), image=None), points, NEAR)
+    with pytest.raises(ImageError, match="for the image"):
+        paint(np.ma.array(labels), points, NEAR)
     with pytest.raises(CalibrationError, match="got NoneType for the calibration"):
         paint(labels, points, None)  # type: ignore[arg-type]
-    for wrong in (np.zeros(4), np.zeros((3, 2)), [[1.0, 2.0, 3.0]], np.array([["a"] * 3])):
-        with pytest.raises(PointsError, match="for points"):
+    for wrong in (np.zeros(4), np.zeros((3, 2)), np.ma.masked_all((2, 3)), np.array([["a"] * 3])):
+        with pytest.raises(PointsError, match=r"got points of shape|got a masked array"):
             paint(labels, wrong, NEAR)  # type: ignore[arg-type]
     with pytest.raises(SensorError):
         paint(labels, points, NEAR, sensor="hdl-65e")

@@ -790,9 +790,15 @@ def test_the_origin_of_a_level_sensor_is_found(tmp_path: Path, kind: str) -> Non
     found = edgeperc.find_origin(source)
     np.testing.assert_allclose(found, origin, atol=0.05)
     np.testing.assert_array_equal(read, read_points(source, origin_m=found))
+    if kind == "named":  # as a data frame, whose columns have another order
+        table = pytest.importorskip("pandas").DataFrame(source)[["z", "intensity", "y", "x"]]
+        np.testing.assert_array_equal(read_points(table, origin_m="auto"), read)
+        assert edgeperc.find_origin(table) == found
 
 
-@pytest.mark.parametrize("source", [POINTS, np.zeros((5, 2)), np.zeros(3), np.zeros((9, 4))])
+@pytest.mark.parametrize(
+    "source", [POINTS, np.zeros((5, 2)), np.zeros(3), np.zeros((9, 4)), [[1.0], [2.0, 3.0]], np.ma.masked_all((9, 4))]
+)
 def test_an_origin_that_cannot_be_found_is_an_error(source: Any) -> None:
     for read in (edgeperc.find_origin, lambda given: read_points(given, origin_m="auto")):
         with pytest.raises(PointsError):

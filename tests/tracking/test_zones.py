@@ -162,6 +162,6 @@ def test_errors_name_the_reason() -> None:
     for ends in (((0, 0), (0, 0)), ((0, 0), (math.inf, 0)), ((0, 0, 0), (1, 0, 0))):
         with pytest.raises(OptionError, match="a line"):
             Line(*ends)
-    for margin_m in (-1.0, math.nan):
+    for margin_m in (-1.0, math.nan, "a"):
         with pytest.raises(OptionError, match="margin_m"):
             Line((0, 0), (1, 0), margin_m=margin_m)

@@ -253,6 +253,9 @@ def test_points_of_a_table_are_taken_by_the_names_of_its_columns(frame: str) -> 
     given = pytest.importorskip("pandas").DataFrame(table) if frame == "pandas" else table
     for take in (placed.to_map, zone.mark, forward_camera().project):
         np.testing.assert_array_equal(take(given), take(points.T))
+        for wrong in (given[["z", "x"]], np.ma.array(points.T), points[0], points.T.astype(str), "points"):
+            with pytest.raises(PointsError):
+                take(wrong)  # type: ignore[arg-type]
 
 
 def test_without_an_origin_nothing_is_in_a_map() -> None:
