@@ -101,11 +101,13 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
     lidar = senders.lidar(topic)
     if lidar is None or (beside and topic not in lidar.senders):
         return None
-    if lidar.mems is not None:
-        raise of_mems(lidar.mems.title)
     if lidar.row is None:
         raise of_livox()
     from .lidars import columns_of, open_spinning, payloads_of  # numba
+    from .mems_packets import MemsFormat
+
+    if isinstance(lidar.row, MemsFormat):
+        raise of_mems(lidar.row.title)
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
     row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None))

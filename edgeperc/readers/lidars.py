@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
-from .mems_packets import MemsStream, mems_format_of
+from .mems_packets import MemsFormat, MemsStream, mems_format_of
 from .packets import Datagrams
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
@@ -79,18 +79,25 @@ def payloads_of(path: Path, sender: str | None, alive: Callable[[], None]) -> It
 def stream_of(
     path: Path, payload: memoryview, units: Iterable[memoryview]
 ) -> tuple[SpinningStream | MemsStream, Callable[[memoryview], bool]] | None:
-    """What makes scans of the packets of a sensor like this one, and tells them from others; None if it has no points.
+    """`open_stream` of a sensor that sends such packets; None if it has no points.
 
     Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
     """
-    if (mems := mems_format_of(payload)) is not None:
-        return MemsStream(mems), lambda other: mems_format_of(other) is mems
-    if (found := format_of(payload)) is not None:
-        row, angles = open_spinning(path, found, units)
-        return SpinningStream(row, angles), partial(is_of, row)
+    if (row := mems_format_of(payload) or format_of(payload)) is not None:
+        return open_stream(path, row, units)
     if (name := name_of(payload)) is not None:
         raise PointsError(not_decoded(name))
     return None
+
+
+def open_stream(
+    path: Path, row: Format | MemsFormat, units: Iterable[memoryview]
+) -> tuple[SpinningStream | MemsStream, Callable[[memoryview], bool]]:
+    """What makes scans of the packets of a format, and tells them from others; PointsError as of `open_spinning`."""
+    if isinstance(row, MemsFormat):
+        return MemsStream(row), lambda payload: mems_format_of(payload) is row
+    found, angles = open_spinning(path, row, units)
+    return SpinningStream(found, angles), partial(is_of, found)
 
 
 def is_of(row: Format, payload: memoryview) -> bool:
@@ -122,18 +129,11 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     """
     first = sender or lidar.first
     if lidar.row is not None:
-        row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, alive))
-        stream = SpinningStream(row, angles)
+        stream, is_of_sensor = open_stream(path, lidar.row, payloads_of(path, sender, alive))
         for payload in payloads_of(path, first, alive):
-            if is_of(row, payload):
+            if is_of_sensor(payload):
                 yield from stream.add(payload)
         yield from stream.end()
-    elif lidar.mems is not None:
-        frames = MemsStream(lidar.mems)
-        for payload in payloads_of(path, first, alive):
-            if mems_format_of(payload) is lidar.mems:
-                yield from frames.add(payload)
-        yield from frames.end()
     else:
         livox = LivoxStream()
         for datagram in Datagrams(path, alive):

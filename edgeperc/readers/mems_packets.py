@@ -24,10 +24,10 @@ _ANGLES = [("distance", ">u2"), ("pitch", ">u2"), ("yaw", ">u2"), ("reflectivity
 _VECTOR = [("distance", ">u2"), ("x", ">i2"), ("y", ">i2"), ("z", ">i2"), ("reflectivity", "u1"), ("more", "V1")]
 
 
-class Format(NamedTuple):
+class MemsFormat(NamedTuple):
     """Packets of one model."""
 
-    title: str
+    title: str  # the model, as its maker calls it
     packet: np.dtype[Any]
     ahead: Callable[[NDArray[Any]], Floats]  # of points: their directions, (..., 3)
 
@@ -49,16 +49,16 @@ def _by_vectors(points: NDArray[Any]) -> Floats:
 
 MEMS_FORMATS = MappingProxyType(
     {
-        1210: Format(
+        1210: MemsFormat(
             "RoboSense M1", _packet(1210, [("micros", "u1"), ("turn", "u1"), ("points", _ANGLES, 5)], 25), _by_angles
         ),
-        1200: Format("RoboSense E1", _packet(1200, [("micros", ">u2"), ("points", _VECTOR, 1)], 96), _by_vectors),
+        1200: MemsFormat("RoboSense E1", _packet(1200, [("micros", ">u2"), ("points", _VECTOR, 1)], 96), _by_vectors),
     }
 )
 """By the bytes of a packet."""
 
 
-def mems_format_of(payload: memoryview) -> Format | None:
+def mems_format_of(payload: memoryview) -> MemsFormat | None:
     """The format of a packet with points; None if it is of another sensor."""
     return MEMS_FORMATS.get(len(payload)) if bytes(payload[:4]) == _MAGIC else None
 
@@ -66,7 +66,7 @@ def mems_format_of(payload: memoryview) -> Format | None:
 class MemsStream:
     """Frames from packets of one format."""
 
-    def __init__(self, row: Format) -> None:
+    def __init__(self, row: MemsFormat) -> None:
         self._row, self._packets, self._last = row, list[bytes](), -1
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:

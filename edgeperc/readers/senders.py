@@ -14,7 +14,7 @@ from .ouster import metadata_beside, read_metadata, reading
 from .packets import DIFOP, GPS_BYTES, Datagrams, is_of_velodyne, sender_names
 
 if TYPE_CHECKING:
-    from .mems_packets import Format as MemsFormat
+    from .mems_packets import MemsFormat
     from .ouster_packets import Layout
     from .spinning_packets import Format
 
@@ -27,8 +27,7 @@ _BY_CHANCE = 20  # packets of other sensors that may begin like these
 class Lidar(NamedTuple):
     """What sends most packets of those that are neither a Velodyne's nor an Ouster's."""
 
-    row: Format | None  # the format of a spinning sensor
-    mems: MemsFormat | None  # of one whose mirror sweeps; None, too: Livox
+    row: Format | MemsFormat | None  # the format of its packets; None: Livox
     senders: list[str]  # of these makers, as `packets.sender_names` calls them
     first: str  # address and port of the one with the most packets
 
@@ -45,8 +44,7 @@ class Senders:
 
     def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
         self._counts = Counter[tuple[str | None, tuple[str, int]]]()  # by kind, None: not known, address and port
-        self._rows: dict[str, Format] = {}  # of the kinds that spin
-        self._mems: dict[str, MemsFormat] = {}
+        self._rows: dict[str, Format | MemsFormat] = {}  # formats by the names of their models
         layouts: list[Layout] = []
         with suppress(PointsError):  # no metadata, or some that cannot be read
             layouts = layouts_beside(path)
@@ -79,10 +77,9 @@ class Senders:
     def _kind_of(self, payload: memoryview) -> str | None:
         """`_LIVOX`, or the model of a LiDAR or what one that is not decoded is called; None: not known."""
         format_of, name_of, points_of, mems_format_of = _recognizers()
-        if (mems := mems_format_of(payload)) is not None:
-            return self._mems.setdefault(mems.title, mems).title
-        if (row := format_of(payload)) is not None:
-            return self._rows.setdefault(row.name, row).name
+        if (row := mems_format_of(payload) or format_of(payload)) is not None:
+            self._rows.setdefault(row.title, row)
+            return str(row.title)
         if points_of(payload) is not None:
             return _LIVOX
         # Version 0, length of the packet; 96 points and more.
@@ -116,9 +113,9 @@ class Senders:
         kind, n = max(kinds.items(), key=lambda item: item[1], default=(None, 0))
         if kind is None or n <= min(n_unknown, _BY_CHANCE):
             return None
-        if kind in self._rows or kind in self._mems or kind == _LIVOX:
+        if kind in self._rows or kind == _LIVOX:
             (address, port), _ = sources[kind].most_common(1)[0]
-            return Lidar(self._rows.get(kind), self._mems.get(kind), names, f"{address}:{port}")
+            return Lidar(self._rows.get(kind), names, f"{address}:{port}")
         if any(other in (_VELODYNE, _OUSTER) for other, _ in self._counts):
             return None
         raise PointsError(not_decoded(kind))
