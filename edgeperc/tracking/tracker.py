@@ -23,14 +23,14 @@ from ..system.fields import OPTIONS
 from ..types.frame import model_rotation
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
-from ..types.points import Floats, Ints64, Records
+from ..types.points import Floats, Ints64, Mask, Records
 from ..types.rigid import rigid
 from . import lives
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
 from .jpda import MAX_EVENTS, Detections, Gates, Predictions, fill_association, fill_likelihoods
 from .tracks import PARAMETERS, ClassParameters, Tracks, strength_of
-from .ukf import fill_predictions, fill_updates
+from .ukf import RANDOM_MOTION, fill_predictions, fill_updates
 
 SMALLEST_SHARE = 1e-13  # scores are clipped to this distance from 0 and 1
 # Standard deviations of random walks of center height, length, width and height after one second.
@@ -42,6 +42,7 @@ FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
 MAX_LANDMARKS = 48
+PEOPLE = ("pedestrian", "cyclist")  # groups of what hardly ever stands; vehicles mostly do
 
 # Beyond these limits squares and differences of numbers lose their meaning, or overflow.
 FARTHEST_M = 1e8  # coordinates of boxes and poses; projected map coordinates are up to 1e7
@@ -245,8 +246,12 @@ class Tracker:
         state, covariance = _combined(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
-            leveled = _leveled(mounting)
-            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, leveled, dt)
+            # Vehicles that may stand are taken to: nothing else corrects a speed that they and the sensor share.
+            people = [k for k, name in enumerate(self._groups) if name in PEOPLE]
+            stands = _slow(tracks, of, state, covariance) & ~np.isin(of["group"], people)
+            place = np.where(stands[:, None], predictions.means[:, RANDOM_MOTION], state)
+            spread = np.where(stands[:, None, None], predictions.covariances[:, RANDOM_MOTION], covariance)
+            estimate = self._estimated_pose(session, tracks, place, spread, given, classes, _leveled(mounting), dt)
             pose, twist, twist_variances = estimate
         detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
         farther = 1.0 + _away(state, of, pose)  # the standard deviations of detections grow
@@ -404,6 +409,12 @@ def _combined(states: Floats, covariances: Floats, modes: Floats) -> tuple[Float
     state, covariance = np.empty((len(states), 5)), np.empty((len(states), 5, 5))
     fill_combined(states, covariances, modes, state, covariance)
     return state, covariance
+
+
+def _slow(tracks: Records, classes: Records, state: Floats, covariance: Floats) -> Mask:
+    """Tracks that are new, or surely slow."""
+    slowest, sigma = classes["moving_mps"], np.sqrt(np.maximum(covariance[:, 2, 2], 0.0))
+    return np.asarray((tracks["hits"] == 1) | ((np.abs(state[:, 2]) < slowest) & (sigma < slowest)))
 
 
 def _detections(given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, pose: Floats) -> Detections:

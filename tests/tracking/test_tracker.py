@@ -127,6 +127,17 @@ def test_without_poses_the_sensors_motion_is_found(tilt_and_turn: tuple[float, f
         assert np.hypot(*track.velocity) < 1.0
 
 
+def test_without_poses_traffic_that_moves_one_way_does_not_take_the_sensor_along() -> None:
+    rng, tracker = np.random.default_rng(0), Tracker()
+    parked = np.column_stack([rng.uniform(5.0, 60.0, 12), rng.choice([-6.0, 9.0], 12)])
+    flowing = np.column_stack([rng.uniform(5.0, 50.0, 8), np.full(8, 4.0)])
+    for k in range(20):
+        flowing[:, 0] += 1.6
+        places = np.vstack([parked, flowing]) + rng.normal(0.0, 0.04, (20, 2))
+        tracks = tracker.update([box("car", *place) for place in places if place[0] < 80.0], 0.4 * k)
+        assert np.hypot(*tracks.T_world_sensor[:2, 3]) < 0.8  # of 30 m that the traffic drives
+
+
 def test_with_poses_what_stands_still_stands_still_in_the_world() -> None:
     tracker, paths, speeds = Tracker(), {}, {}
     for k, (boxes, pose) in enumerate(drive(60)):
