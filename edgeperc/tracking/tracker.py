@@ -23,7 +23,7 @@ from ..system.fields import OPTIONS
 from ..types.frame import model_rotation
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
-from ..types.points import Floats, Ints64, Mask, Records
+from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
 from . import lives
 from .egomotion import fit_motion
@@ -248,7 +248,8 @@ class Tracker:
         if pose is None:
             # Vehicles that may stand are taken to: nothing else corrects a speed that they and the sensor share.
             people = [k for k, name in enumerate(self._groups) if name in PEOPLE]
-            stands = _slow(tracks, of, state, covariance) & ~np.isin(of["group"], people)
+            slow = np.maximum(state[:, 2] ** 2, covariance[:, 2, 2]) < of["moving_mps"] ** 2
+            stands = ((tracks["hits"] == 1) | slow) & ~np.isin(of["group"], people)
             place = np.where(stands[:, None], predictions.means[:, RANDOM_MOTION], state)
             spread = np.where(stands[:, None, None], predictions.covariances[:, RANDOM_MOTION], covariance)
             estimate = self._estimated_pose(session, tracks, place, spread, given, classes, _leveled(mounting), dt)
@@ -409,12 +410,6 @@ def _combined(states: Floats, covariances: Floats, modes: Floats) -> tuple[Float
     state, covariance = np.empty((len(states), 5)), np.empty((len(states), 5, 5))
     fill_combined(states, covariances, modes, state, covariance)
     return state, covariance
-
-
-def _slow(tracks: Records, classes: Records, state: Floats, covariance: Floats) -> Mask:
-    """Tracks that are new, or surely slow."""
-    slowest, sigma = classes["moving_mps"], np.sqrt(np.maximum(covariance[:, 2, 2], 0.0))
-    return np.asarray((tracks["hits"] == 1) | ((np.abs(state[:, 2]) < slowest) & (sigma < slowest)))
 
 
 def _detections(given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, pose: Floats) -> Detections:
