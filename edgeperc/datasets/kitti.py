@@ -161,8 +161,8 @@ def label_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def read_labels(path: Path) -> KittiLabels:
-    """Read the rows of a KITTI label file. Raises PointsError, which names the line."""
-    rows = []
+    """Read the rows of a KITTI label file, copies once: nothing can find both. PointsError, which names the line."""
+    rows: dict[tuple[str, tuple[float, ...]], None] = {}
     for number, line in label_lines(path):
         words = line.split()
         try:
@@ -176,7 +176,7 @@ def read_labels(path: Path) -> KittiLabels:
             )
         if wrong := wrong_in_label(words[0], values):
             raise PointsError(f"{path}, line {number}: {wrong}")
-        rows.append((words[0].lower(), values))
+        rows[words[0].lower(), (*values,)] = None
     numbers = np.array([values for _, values in rows], np.float64).reshape(-1, 14)
     return KittiLabels(tuple(kind for kind, _ in rows), numbers)
 
@@ -185,10 +185,13 @@ def wrong_in_label(kind: str, numbers: Sequence[float]) -> str:
     """What is wrong with the 14 numbers of a label, as a sentence; empty if nothing is."""
     if not np.isfinite(numbers).all():
         return "expected a class and 14 finite numbers, got one that is not finite"
+    left, top, right, bottom = numbers[3:7]
+    if 0.0 <= right < left or 0.0 <= bottom < top:  # a side beyond the image may be at the other side of its edge
+        return f"expected left, top, right and bottom of a rectangle, got {left:g}, {top:g}, {right:g} and {bottom:g}"
     if kind.lower() == "dontcare":
         return ""
     *size, _, _, _, turn = numbers[7:14]
-    if not all(0.0 < meters < _LARGEST_M for meters in size):
+    if not all(0.0 < meters < LARGEST_M for meters in size):
         return (
             f"expected a height, width and length above 0 m, got {', '.join(f'{each:g}' for each in size)}; an object "
             "without a box in 3-D is a DontCare"
@@ -207,7 +210,7 @@ def check_in_image(labels: KittiLabels, size: tuple[int, int], path: Path) -> No
         )
 
 
-_LARGEST_M, WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
+LARGEST_M, WHOLE_TURN = 100.0, 6.3  # of KITTI's objects, a tram is the longest, 35 m
 _BEYOND_PX = 2.0  # KITTI's images differ by the day
 
 

@@ -364,6 +364,9 @@ CAR_LINE = "Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
         (CAR_LINE.replace(" ", ","), r"line 1: .* got 0"),
         ("\ufeff" + CAR_LINE + "\n\x00", r"line 2: "),
         (CAR_LINE.encode("utf-16"), "the labels cannot be read"),
+        # Left, top, width and height: nothing lay in such a region, and no such object was counted.
+        ("DontCare -1 -1 -10 503 169 90 190 -1 -1 -1 -1 -1 -1 -10", "line 1: expected left, top, right and bottom"),
+        (CAR_LINE.replace("700 300", "700 100"), r"line 1: .* of a rectangle, got 500, 150, 700 and 100"),
     ],
 )
 def test_malformed_labels_name_the_line(text: str | bytes, error: str, tmp_path: Path) -> None:
@@ -380,5 +383,7 @@ def test_labels_as_other_tools_write_them(mark: str, end: str, tmp_path: Path) -
     labels = read_labels(tmp_path / "a.txt")
     (tmp_path / "b.txt").write_text("DontCare -1 -1 -10 503 169 590 190 -1 -1 -1 -1000 -1000 -1000 -10\n")
     assert read_labels(tmp_path / "b.txt").kinds == ("dontcare",)
+    (tmp_path / "c.txt").write_text(f"{CAR_LINE.replace('500 150 700', '0 150 -9')}\n" * 3)  # outside of the image
+    assert read_labels(tmp_path / "c.txt").kinds == ("car",)  # once, as nothing can find its copies
     assert labels.kinds == ("car",)
     np.testing.assert_array_equal(labels.numbers, [[float(word) for word in CAR_LINE.split()[1:]]])
