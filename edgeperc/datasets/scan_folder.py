@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -56,6 +57,7 @@ from .layout import (
 
 __all__ = ["ScanFolder", "ScanFrame"]
 
+LABEL_FOLDERS = ("label", "label_2", "labels", "semseg", "drivable")
 MARGIN_M = 0.05  # a label box is often a little smaller than its object
 
 
@@ -248,7 +250,10 @@ class ScanFolder:
             kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
             image_labels = kitti.KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
-            boxes = self._renamed(self._read_boxes(path, name), path)
+            # A copy would be an object that nothing can find. Two files of Argoverse 2 have one, of a car each.
+            boxes = self._renamed([*dict.fromkeys(self._read_boxes(path, name))], path)
+            if huge := [box for box in boxes if box.label != IGNORED and max(box.size) >= kitti.LARGEST_M]:
+                raise PointsError(f"{path}: a {huge[0].label} of {max(huge[0].size):g} m; expected less than 100 m")
         classes, area = self._path("points", name), self._path("drivable", name)
         point_classes = None if classes is None else self._read_classes(classes, len(points))
         drivable = None if area is None else _read_polygons(area)
@@ -295,12 +300,18 @@ class ScanFolder:
                     f"{self.root} has label files in {folders}, but the description has no {kind!r}; map their classes "
                     f'there, such as {{"{kind}": {{"Car": "car", "*": "ignore"}}}}'
                 )
-        labeled = [name for name in self.scans if any(self._path(k, name) for k in ("boxes", "points", "drivable"))]
+        files = {name: [self._path(kind, name) for kind in ("boxes", "points", "drivable")] for name in self.scans}
+        labeled = [name for name, paths in files.items() if any(paths)]
         if not labeled:
             raise PointsError(
                 f"{self.root} has no labels for its scans ({next(iter(self.scans))}, ...); expected label/NAME.txt, "
                 "semseg/NAME.u8 or drivable/NAME.json (with box_format kitti: label_2/NAME.txt and calib/NAME.txt)"
             )
+        read = {path for paths in files.values() for path in paths if path}
+        places = {path.parent for path in read} | {self.root / name for name in LABEL_FOLDERS}
+        if unread := {path for folder in places for path in folder.glob("[!._]*")} - read:
+            told = f"{len(unread):,} label files of no scan or of another format, which are left out"
+            warnings.warn(f"{self.root} has {told}, such as {min(unread).relative_to(self.root)}", stacklevel=2)
         if self.layout.files == "semantickitti":
             sequences = {name: name.partition("/")[0] for name in labeled}
             return {name: kitti.SEQUENCE_DRIVES.get(sequence, sequence) for name, sequence in sequences.items()}
@@ -319,11 +330,11 @@ class ScanFolder:
         """A drive that ``splits`` misspells would be listed nowhere, which is for training and testing."""
         listed, drives = {d for of_split in self.layout.splits.values() for d in of_split}, {*self.drives.values()}
         absent, unlisted = sorted(listed - drives - {ANY}), sorted(drives - listed)
-        if absent and unlisted and ANY not in listed:
+        if absent and unlisted and not any(ANY in self.layout.splits.get(of, ()) for of in ("validation", "test")):
             raise PointsError(
                 f"{self.root}: splits lists the drive {absent[0]!r:.60}, which has no labeled scan, and not the drive "
                 f"{unlisted[0]!r:.60}, which has some; correct the names (those of frames.csv; without it, of the "
-                "scans), or say with '*' where all others belong"
+                "scans), leave that one out, or keep all others back with '*' under test"
             )
 
     def _read_boxes(self, path: Path, name: str) -> list[Box]:

@@ -198,6 +198,7 @@ POLYGONS = ("{", "3", "[[[0, 0], [1, 1]]]", '[[["a", 0]]]', "[[[0,0],[1,1],[1e99
     ("file", "text", "message"),
     [
         *(("label__a_dot_txt", f"Car 10 0 -1 4 2 1.6 0\nCar {box}\n", r"a\.txt, line 2: .*expected") for box in BOXES),
+        ("label__a_dot_txt", "Car 10 0 -1 4000 2000 1600 0\n", r"a\.txt: a car of 4000 m; expected less than 100 m"),
         *(("drivable__a_dot_json", text, "polygon") for text in POLYGONS),
         ("frames_dot_csv", "name,drive\n", "both filled"),
         ("frames_dot_csv", "name,drive\na,\n", "both filled"),
@@ -207,6 +208,14 @@ POLYGONS = ("{", "3", "[[[0, 0], [1, 1]]]", '[[["a", 0]]]', "[[[0,0],[1,1],[1e99
 def test_files_that_are_wrong(tmp_path: Path, file: str, text: str, message: str) -> None:
     with pytest.raises(PointsError, match=message):
         ScanFolder(folder_of(tmp_path, **{"label__a_dot_txt": "", file: text})).frame("a")
+
+
+def test_labels_that_are_there_twice_count_once_and_those_of_no_scan_are_told_of(tmp_path: Path) -> None:
+    """The copy of an object was one that nothing can find; a label of a mistyped name was left out in silence."""
+    root = folder_of(tmp_path, label__a_dot_txt=LINES + LINES, label__B_dot_TXT=LINES, semseg__c_dot_u8="1")
+    with pytest.warns(UserWarning, match=r"has 2 label files of no scan or of .* left out, such as label/B\.TXT"):
+        folder = ScanFolder(root)
+    assert folder.frame("a").returns == (1, 0, 1, 1)
 
 
 def test_boxes_of_a_class_that_is_not_mapped(tmp_path: Path) -> None:
@@ -400,10 +409,11 @@ def test_a_drive_that_splits_misspells_is_not_for_training(tmp_path: Path) -> No
     with pytest.raises(PointsError, match=r"the drive 'monday', which has no labeled scan, and not the drive 'a'"):
         ScanFolder(root)  # nobody wrote frames.csv
     (root / "frames.csv").write_text("name,drive\na,monday\nb,tuesdays\n")
-    with pytest.raises(
-        PointsError, match="the drive 'tuesday', which has no labeled scan, and not the drive 'tuesdays'"
-    ):
-        ScanFolder(root)
+    for train in ("monday", "*"):  # all others were trained on, the misspelt drive of the test too
+        folder_of(root, {**description, "splits": {"train": [train], "test": ["tuesday"]}})
+        with pytest.raises(PointsError, match=r"the drive 'tuesday', which has no .* the drive '(tuesdays|mon)"):
+            ScanFolder(root)
+    folder_of(root, description)
     (root / "frames.csv").write_text("name,drive\na,tuesday\nb,tuesday\n")
     assert ScanFolder(root).names("train") == []  # the scans of Monday lie elsewhere
     (root / "frames.csv").write_text("name,drive\na,tuesday\nb,friday\n")
