@@ -10,7 +10,7 @@ import math
 import os
 import reprlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from ..errors import CardError
@@ -440,39 +440,35 @@ class ModelCard:
         """
         text = read_metadata(path, CARD_KEY)
         if text is None:
-            raise CardError(
-                f"{os.fspath(path)} has no card; write one with: edgeperc-export card MODEL --card CARD.json"
-            )
+            raise CardError(f"{os.fspath(path)} has no card; write one with: edgeperc-export card MODEL CARD.json OUT")
         try:
             return cls.from_json(text)
         except CardError as exc:
             raise CardError(f"{os.fspath(path)}: {exc}") from exc
 
     @classmethod
-    def from_json(cls, text: str) -> ModelCard:
-        """Read a card.
+    def from_json(cls, text: str, *, exact: bool = False) -> ModelCard:
+        """Read a card; with ``exact``, one that was written by hand, whose unknown keys are misspelt.
 
         Raises
         ------
         CardError
             Not JSON, another schema, or a key that is missing, of another type or out of its bounds.
-            Unknown keys are ignored.
+            Unknown keys are ignored, unless ``exact``.
         """
         if len(text) > MAX_CHARACTERS:
             raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
-        document = FIELDS.document(text, SCHEMA)
+        document, known = FIELDS.document(text, SCHEMA), replace(FIELDS, exact=exact)
         _check_tree(document)
-        view = FIELDS.read(Mapping[str, Any], document.get("view"), "view")  # type: ignore[type-abstract]
-        if view.get("kind") not in [*VIEWS]:
-            FIELDS.refuse("view.kind", view.get("kind"), "top_view, range_image, camera, objects or pillars")
-        geometry = FIELDS.entry(VIEWS[view["kind"]], view, "view")
-        head = document.get("head")
-        if head is not None:
-            kind = head.get("kind") if isinstance(head, Mapping) else head
-            if kind not in [*HEADS]:
-                FIELDS.refuse("head.kind", kind, "anchors or centers")
-            head = FIELDS.entry(HEADS[kind], head, "head")
-        return FIELDS.read(cls, {**document, "view": geometry, "head": head})
+        for name, kinds in {"view": VIEWS, "head": HEADS}.items():
+            if name == "head" and document.get(name) is None:
+                continue
+            entries = {**FIELDS.entry(Mapping[str, Any], document.get(name), name)}
+            kind = entries.pop("kind", None)
+            if kind not in [*kinds]:
+                FIELDS.refuse(f"{name}.kind", kind, " or ".join(kinds))
+            document[name] = known.entry(kinds[kind], entries, name)
+        return known.read(cls, document)
 
 
 def _check_tree(document: Any) -> None:

@@ -998,6 +998,9 @@ def test_a_card_that_does_not_fit_writes_nothing(
     said = shell.err(*card_command(tmp_path, path, copied))
     assert "card.json: the golden record is of another network" in said
     assert "Set golden and fitness to null" in said
+    words = card_command(tmp_path, path, card)
+    Path(words[2]).write_text(card.to_json().replace('"nms_iou"', '"license":"MIT","nms_iou"'))
+    assert "card.json: the card has unknown entries license; expected some of" in shell.err(*words)
     assert not (tmp_path / "out.onnx").exists()
 
 

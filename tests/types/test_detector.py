@@ -57,6 +57,9 @@ def test_the_documented_card_is_that_of_openpcdet() -> None:
     assert card.head.n_anchors == 6
     assert not card.view.is_all_around
     assert not card.input.needs_ground
+    assert ModelCard.from_json(KITTI, exact=True) == card
+    with pytest.raises(CardError, match=r"head\.anchors\[0\] has unknown entries ranges; expected some of .*range_m"):
+        ModelCard.from_json(KITTI.replace('"yaws_rad"', '"ranges": [0], "yaws_rad"'), exact=True)
 
 
 @pytest.mark.parametrize("given", [document(), centers(), document() | {"outputs": document()["outputs"][:2]}])
