@@ -343,7 +343,7 @@ def _card(args: argparse.Namespace) -> None:
             "or export the network with external_data=False"
         ) from exc
     try:
-        card = ModelCard.from_json(_json_text(args.card))
+        card = ModelCard.from_json(_json_text(args.card), exact=True)
     except (CardError, UnicodeDecodeError) as exc:
         raise CardError(f"{args.card}: {exc}") from exc
     known = with_golden(model, card)
@@ -430,7 +430,8 @@ def _quantize(args: argparse.Namespace) -> None:
     )
     print_line(json.dumps(dict(card.parity)))
     print_line(
-        f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}"
+        "a file runs as it is, by its path; what it loses on your scans is said, and written into its card, by: "
+        f"edgeperc-export agree {args.model} {args.out}"
     )
 
 

@@ -407,5 +407,5 @@ def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, poin
             raise SplitError(
                 f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate drives "
                 "that were held back, or models trained without this drive (--model), or, with 'edgeperc eval', split "
-                "'train'"
+                "'train'; if splits of a description do not list the drive, it is for both: list it, or '*', as train"
             )
