@@ -440,7 +440,7 @@ class ModelCard:
         """
         text = read_metadata(path, CARD_KEY)
         if text is None:
-            raise CardError(f"{os.fspath(path)} has no card; write one with: edgeperc-export card MODEL CARD.json OUT")
+            raise CardError(f"{os.fspath(path)} has no card; write one: edgeperc-export card MODEL CARD.json OUT")
         try:
             return cls.from_json(text)
         except CardError as exc:
