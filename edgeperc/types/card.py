@@ -448,13 +448,12 @@ class ModelCard:
 
     @classmethod
     def from_json(cls, text: str, *, exact: bool = False) -> ModelCard:
-        """Read a card; with ``exact``, one that was written by hand, whose unknown keys are misspelt.
+        """Read a card; unknown keys are ignored, or refused with ``exact``, as misspelt by hand.
 
         Raises
         ------
         CardError
             Not JSON, another schema, or a key that is missing, of another type or out of its bounds.
-            Unknown keys are ignored, unless ``exact``.
         """
         if len(text) > MAX_CHARACTERS:
             raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
