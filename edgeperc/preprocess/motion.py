@@ -400,7 +400,7 @@ def merge(
     if len(poses) != len(rows):
         raise SensorError(f"got {len(poses)} poses for {len(rows)} scans; expected one for each")
     ranges_m = min_range_m if isinstance(min_range_m, Sequence) or np.ndim(min_range_m) else [min_range_m] * len(rows)
-    ranges_m = OPTIONS.numbers("min_range_m", ranges_m, len(rows), 0.0)
+    ranges_m = OPTIONS.numbers("min_range_m, one for each scan,", ranges_m, len(rows), 0.0)
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
     begin = 0
     for k, (scan, given, range_m) in enumerate(zip(rows, poses, ranges_m, strict=True)):

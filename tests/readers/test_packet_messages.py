@@ -351,7 +351,7 @@ def test_points_in_livox_own_type(tmp_path: Path, package: str, version: int) ->
         np.testing.assert_array_equal(scan.points[:, 3], remission)
         if len(xyz):
             np.testing.assert_allclose(scan.times_s, times_s, atol=1e-6)
-    with pytest.raises(SensorError, match=r"of a Livox sensor, which does not spin, .*--sensor mid-360"):
+    with pytest.raises(SensorError, match=r"of a Livox sensor, which does not spin, .*--sensor: mid-360"):
         sensor_of(path)
     with pytest.raises(PointsError, match="damaged"):
         CLOUD_READERS[(kind, "cdr") if version == 2 else (f"{package}/CustomMsg", "ros1")](memoryview(sent[0][:-1]))
