@@ -104,15 +104,16 @@ def kept_files(packages: Sequence[Path]) -> Iterator[Path]:
 
     for package in packages:
         yield from package.rglob("__pycache__/*.kernel")
-    if named := os.environ.get("NUMBA_CACHE_DIR"):
+    if os.access(named := os.environ.get("NUMBA_CACHE_DIR", ""), os.R_OK):
         yield from Path(named).glob("*/*.kernel")
     try:
         cache = cache_folder()
     except SettingsError:  # there is no home folder
         return
     for part in ("kernels", "compiled"):
-        yield from (file for file in (cache / part).rglob("*") if file.is_file() or file.is_symlink())
-    if settings_path().is_file():
+        files = (cache / part).rglob("*") if os.access(cache / part, os.R_OK) else ()
+        yield from (file for file in files if file.is_file() or file.is_symlink())
+    if os.access(settings_path(), os.F_OK) and settings_path().is_file():
         yield settings_path()
 
 
@@ -262,20 +263,14 @@ def _caches() -> Iterator[Finding]:
     except SettingsError as exc:
         yield Finding("cache folder", "note", one_line(exc))
         return
-    for name, part in (
-        ("cache folder", folder),
-        ("compiled models", folder / "compiled"),
-        ("compiled kernels", folder / "kernels"),
-    ):
-        if name != "cache folder" and not part.exists():
+    for name, inside in (("cache folder", ""), ("compiled models", "compiled"), ("compiled kernels", "kernels")):
+        is_there = os.access(part := folder / inside, os.F_OK)  # False in the home of another user
+        if part != folder and not is_there:
             continue
-        reason = _unwritable(part) or (unsafe_because(part.stat()) if part.exists() else None)
-        content = _size(part) if part.exists() else "not made yet"
-        if reason is None:
-            yield Finding(name, "ok", f"{part}: {content}, writable")
-        else:
-            again = "what is compiled anew is not kept; set EDGEPERC_CACHE_DIR to a folder that only you can write"
-            yield Finding(name, "note", f"{part}: {content}, {reason}", again)
+        reason = _unwritable(part) or (unsafe_because(part.stat()) if part != folder else None)
+        found = f"{part}: {_size(part) if is_there else 'not made yet'}, {reason or 'writable'}"
+        advice = "what is compiled anew is not kept; set EDGEPERC_CACHE_DIR to a folder that only you can write"
+        yield Finding(name, "note", found, advice) if reason else Finding(name, "ok", found)
     try:
         measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT_MODELS]
     except SettingsError as exc:
@@ -289,7 +284,7 @@ def _caches() -> Iterator[Finding]:
 
 def _unwritable(folder: Path) -> str | None:
     """Why files cannot be made in a folder, or the folder itself; None if they can."""
-    place = next(path for path in (folder, *folder.parents) if path.exists())
+    place = next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
     if not place.is_dir():
         return f"{place} is not a folder"
     return None if os.access(place, os.W_OK | os.X_OK) else f"{place} cannot be written"

@@ -17,6 +17,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -81,10 +82,8 @@ def missing(kernels: Iterable[Any]) -> list[Any]:
     """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
     left = {kernel._cache.name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
     for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache.folders()):
-        for file in folder.glob("*.kernel") if left and unusable_because(folder) is None else ():
-            kernel = left.get(file.name.rpartition("-")[0])
-            if kernel is not None and _stamp_of(file) == kernel._cache.stamp():
-                del left[kernel._cache.name]
+        held = _held(folder) if left and unusable_because(folder) is None else ()
+        left = {name: kernel for name, kernel in left.items() if (name, kernel._cache.stamp()) not in held}
     return [*left.values()]
 
 
@@ -136,8 +135,7 @@ class KernelCache:
 
     def _is_in(self, folder: Path) -> bool:
         """Whether a folder holds a compiled form of this kernel, for any types."""
-        stamp = self.stamp()
-        return any(_stamp_of(file) == stamp for file in folder.glob(f"{self.name}-*.kernel"))
+        return (self.name, self.stamp()) in _held(folder)
 
     def flush(self) -> None:
         """Nothing: files of another stamp are replaced when they are met."""
@@ -297,13 +295,14 @@ def _read(file: Path) -> tuple[bytes, bytes] | None:
     return rest[:_DIGEST_BYTES], rest[_DIGEST_BYTES:]
 
 
-def _stamp_of(file: Path) -> bytes:
-    """The stamp of a file, which may be damaged; empty if it cannot be read."""
-    try:
-        with file.open("rb") as opened:
-            return opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]
-    except OSError:
-        return b""
+def _held(folder: Path) -> set[tuple[str, bytes]]:
+    """Names and stamps of the kernels in a folder, whose files may be damaged; none of what cannot be read."""
+    found = set()
+    with suppress(OSError):  # in the home of another user, not even whether there is a folder
+        for file in [each for each in folder.iterdir() if each.suffix == ".kernel"]:
+            with suppress(OSError), file.open("rb") as opened:
+                found.add((file.name.rpartition("-")[0], opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]))
+    return found
 
 
 def _can_be_written(folder: Path) -> bool:

@@ -12,6 +12,7 @@ from email.message import Message
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -166,6 +167,7 @@ def test_a_cache_that_others_can_write_with_settings_that_cannot_be_read(tmp_pat
     (tmp_path / "cache" / "compiled").mkdir(parents=True)
     (tmp_path / "cache" / "compiled" / "blob").write_bytes(bytes(2_000_000))
     (tmp_path / "cache" / "compiled").chmod(0o777)
+    (tmp_path / "cache").chmod(0o775)  # as many systems make it; what lies in it is this user's alone
     (tmp_path / "cache" / "settings.json").write_text("no json")
     found = report(shell, 0)
     assert found["cache folder"]["state"] == "ok"
@@ -174,6 +176,14 @@ def test_a_cache_that_others_can_write_with_settings_that_cannot_be_read(tmp_pat
     assert "other users can write it" in found["compiled models"]["found"]
     assert found["settings"]["state"] == "note"
     assert "cannot be read as settings" in found["settings"]["found"]
+
+
+def test_a_home_of_another_user(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    stat, refuse = Path.stat, Mock(side_effect=PermissionError(13, "Permission denied"))
+    monkeypatch.setattr(Path, "stat", lambda path, **how: (refuse if tmp_path in path.parents else stat)(path, **how))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache" / "kernels"))
+    assert "cache: not made yet" in report(shell, 0)["cache folder"]["found"]
+    assert not [*doctor.kept_files([])]
 
 
 @pytest.fixture

@@ -375,6 +375,10 @@ def test_a_read_only_package_and_no_home_are_reported(
     else:
         (tmp_path / "user").write_bytes(b"")
     named = [without_setting.source.parent, *[tmp_path / "user"] * (home != "none")]
+    stat, refuse = Path.stat, Mock(side_effect=PermissionError(13, "Permission denied"))
+    with monkeypatch.context() as patch:  # folders as in the home of another user
+        patch.setattr(Path, "stat", lambda path, **how: (stat if path.suffix else refuse)(path, **how))
+        assert len(kernel_cache.missing([without_setting.load().total])) == 1
     for _ in range(2):
         (warning,), n_compiled = without_setting.start()
         assert n_compiled == 2
