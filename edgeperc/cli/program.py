@@ -65,6 +65,7 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
     an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP, 141 in silence if what reads
     it closed it.
     """
+    _fill_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
     raised: list[int] = []
@@ -76,8 +77,7 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
                 try:
                     code = command()
                 finally:
-                    if sys.stdout is not None:
-                        sys.stdout.flush()
+                    sys.stdout.flush()
         except BaseException as exc:
             if isinstance(exc, KeyboardInterrupt) and not raised:  # by the process's own handler
                 raised.append(signal.SIGINT)
@@ -98,16 +98,21 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
         raise
 
 
+def _fill_streams() -> None:
+    """Discard what is printed where a service has closed a stream: the next file would get its number, and the text."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            os.set_inheritable(number := os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
+            setattr(sys, name, os.fdopen(number, "w", errors="backslashreplace"))
+
+
 def _unread() -> bool:
     """Whether the reader of stdout or stderr closed it. Such a stream is discarded from here on."""
-    is_closed = False
-    for stream in (sys.stdout, sys.stderr):
-        if _is_closed_pipe(stream):
-            # Python flushes the streams again at exit, and would print an error.
-            with Path(os.devnull).open("wb") as nowhere:
-                os.dup2(nowhere.fileno(), stream.fileno())
-            is_closed = True
-    return is_closed
+    closed = [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
+    for stream in closed:  # Python flushes it again at exit, and would print an error
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), stream.fileno())
+    return bool(closed)
 
 
 def _is_closed_pipe(stream: TextIO) -> bool:

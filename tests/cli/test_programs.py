@@ -222,13 +222,17 @@ def start(program: str, *arguments: str, before: str = "", **how: Any) -> subpro
     return subprocess.Popen([sys.executable, "-c", code, *arguments], **how)
 
 
-# A command that says that it runs, and then waits.
-WAITING = (
-    "import argparse, time\n"
-    "def wait(*_):\n    print('runs', flush=True)\n    time.sleep(600)\n"
-    "class Known(argparse.Namespace): command = run = wait\n"
-    "argparse.ArgumentParser.parse_args = lambda *_, **__: Known()"
-)
+def commanded(act: str) -> str:
+    return (
+        "import argparse, time\n"
+        "from edgeperc.cli.output import print_error, print_line, print_result, progress\n"
+        f"def act(*_):\n    {act}\n"
+        "class Known(argparse.Namespace): command = run = act\n"
+        "argparse.ArgumentParser.parse_args = lambda *_, **__: Known()"
+    )
+
+
+WAITING = commanded("print('runs', flush=True); time.sleep(600)")
 
 
 @posix
@@ -252,16 +256,8 @@ def test_every_program_ends_by_a_signal_in_one_line(program: str, number: int) -
     ("program", "stream"), [*((program, "stdout") for program in PROGRAMS), ("edgeperc", "stderr")]
 )
 def test_every_program_is_quiet_when_nobody_reads(program: str, stream: str) -> None:
-    talking = (
-        "import argparse\n"
-        "from edgeperc.cli.output import print_error, print_line\n"
-        "def talk(*_):\n"
-        f"    for _ in range(10_000): {'print_line' if stream == 'stdout' else 'print_error'}('line')\n"
-        "    return 0\n"
-        "class Known(argparse.Namespace): command = run = talk\n"
-        "argparse.ArgumentParser.parse_args = lambda *_, **__: Known()"
-    )
-    with start(program, before=talking) as process:
+    talk = "print_line" if stream == "stdout" else "print_error"
+    with start(program, before=commanded(f"for _ in range(10_000): {talk}('line')")) as process:
         closed, other = (process.stdout, process.stderr) if stream == "stdout" else (process.stderr, process.stdout)
         closed.close()
         assert other.read() == b""
@@ -279,12 +275,15 @@ def test_help_is_quiet_when_nobody_reads(program: str) -> None:
 
 
 @posix
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_a_closed_stdout_is_no_error(program: str) -> None:
-    with start(program, "--version", stdout=None, preexec_fn=lambda: os.close(1)) as process:
-        _, errors = process.communicate(timeout=120)
-    assert process.returncode == 0
-    assert b"Traceback" not in errors
+@pytest.mark.parametrize(
+    ("program", "closed"), [*((program, [1]) for program in PROGRAMS), ("edgeperc", [2]), ("edgeperc", [0, 1, 2])]
+)
+def test_closed_streams_take_what_is_printed_and_no_file_their_numbers(program: str, closed: list[int]) -> None:
+    talk = "print_line('line', gray=True), print_result('line'), print_error('line')"
+    act = f"with progress() as show, open('/dev/null') as file: show(1, 2), {talk}; return 4 + file.fileno()"
+    how = dict.fromkeys(("stdin", "stdout", "stderr")) | {"preexec_fn": lambda: [os.close(each) for each in closed]}
+    with start(program, before=commanded(act), **how) as process:
+        assert process.wait(120) > 6
 
 
 @posix
