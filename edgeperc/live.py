@@ -300,7 +300,7 @@ class _Inbox:
 
     def __init__(self) -> None:
         self.stopped = threading.Event()
-        self.n_scans = self.n_dropped = 0
+        self.n_scans, self.n_dropped, self._made_in = 0, 0, os.getpid()
         # Entered as a lock: a signal while a condition is entered leaves it locked.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
@@ -327,6 +327,8 @@ class _Inbox:
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> tuple[tuple[Any, float, float], int, int] | None:
+        if os.getpid() != self._made_in:
+            raise EdgepercError(f"this stream is read by process {self._made_in}; make another one in its fork")
         if timeout_s is not None and timeout_s > threading.TIMEOUT_MAX:
             timeout_s = None
         with self._lock:

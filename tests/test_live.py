@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 import threading
 import warnings
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import pytest
 
 import edgeperc
 from edgeperc import live
-from edgeperc.errors import InferenceError, OptionError, PointsError, StampError
+from edgeperc.errors import EdgepercError, InferenceError, OptionError, PointsError, StampError
 from edgeperc.live import stream
 from waiting import TIMEOUT_S, until
 
@@ -287,6 +288,9 @@ def test_a_source_that_blocks_for_ever_holds_nobody_up(source: Source, monkeypat
     source.give(scan(1), last=True)
     until(lambda: not reader.is_alive())
     assert answers.n_scans == 0
+    monkeypatch.setattr(os, "getpid", lambda: 1)  # as in a child
+    with pytest.raises(EdgepercError, match="make another one in its fork"):
+        next(answers)
 
 
 def test_a_stream_that_is_forgotten_stops(source: Source) -> None:

@@ -65,7 +65,7 @@ def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Ti
     with (
         tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder,
         start_process(folder) as process,
-        _Watch(process) as watch,
+        Watch(process) as watch,
     ):
         assert process.stdin is not None
         assert process.stdout is not None
@@ -94,46 +94,52 @@ def start_process(folder: str) -> subprocess.Popen[bytes]:
         [python, *interpreter_flags(), "-W", "ignore", "-c", START, *sys.path],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL if sys.stderr is None else None,  # its number would become that of the replies
         env={**os.environ, **one_thread, **temporary},
         creationflags=flags,
         start_new_session=os.name == "posix",  # Ctrl-C is for this process, which then ends the other
     )
 
 
-class _Watch:
+class Watch:
     """A thread that ends the process when a reply, awaited since ``since_s`` on the monotonic clock, takes too long;
-    not every system can wait for a pipe with a limit.
+    not every system can wait for a pipe with a limit. Time in which this process is stopped, as by Ctrl-Z, is none.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.since_s: float | None = None
         self.expired = False
-        self._process, self._over = process, threading.Event()
-        self._thread = threading.Thread(target=self._run, name="edgeperc-capture", daemon=True)
+        self._process, self.over = process, threading.Event()
+        self._thread = threading.Thread(target=self.run, name="edgeperc-capture", daemon=True)
 
-    def _run(self) -> None:
-        while not self._over.wait(min(1.0, SCAN_LIMIT_S)):
-            since_s = self.since_s
-            if since_s is not None and time.monotonic() - since_s > SCAN_LIMIT_S:
+    def run(self) -> None:
+        """Wait beside those who read replies."""
+        tick_s, waited_s, former_s = min(1.0, SCAN_LIMIT_S), 0.0, self.since_s
+        while not self.over.wait(tick_s):
+            waited_s = waited_s + tick_s if self.since_s == former_s else 0.0
+            former_s = self.since_s
+            if former_s is not None and waited_s > SCAN_LIMIT_S:
                 self.expired = True
                 self._process.kill()
                 return
 
-    def __enter__(self) -> _Watch:
+    def __enter__(self) -> Watch:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self.over.set()
         self._thread.join()
 
 
 def _replies(
-    process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch, found: list[Any]
+    process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: Watch, found: list[Any]
 ) -> Iterator[TimedScan]:
-    n_scans, ready = 0, False
+    n_scans, ready, made_in = 0, False, os.getpid()
     times_s: Floats | None = None
     while True:
+        if os.getpid() != made_in:  # scans would be missing there
+            raise PointsError(f"{path} is read by process {made_in}; read it anew in its fork")
         watch.since_s = time.monotonic()
         header = replies.read(HEADER.size)
         if len(header) < HEADER.size:

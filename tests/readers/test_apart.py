@@ -106,19 +106,32 @@ def test_an_application_that_embeds_python_or_is_frozen_is_not_started_again(
 
 
 def test_a_scan_that_takes_too_long(ouster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = apart.Watch(Mock())
+    watch.since_s = -1e6  # since then this process was stopped, as by Ctrl-Z
+    watch.over = Mock(wait=Mock(side_effect=[*[False] * 60, True]))
+    watch.run()
+    assert not watch.expired
     monkeypatch.setattr(apart, "SCAN_LIMIT_S", 0.01)  # less than importing the library takes
     with pytest.raises(PointsError, match=r"took longer than 0\.01 s"):
         next(read_scans(ouster / "sphere.pcap"))
 
 
-def test_the_process_ends_with_the_iterator(ouster: Path, started: list[subprocess.Popen[bytes]]) -> None:
+def test_the_process_ends_with_the_iterator(
+    ouster: Path, started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", None)  # closed, and its number would be that of the replies
     scans = read_scans(ouster / "sphere.pcap")
     next(scans)
     assert started[0].poll() is None
+    assert sys.platform != "linux" or Path(f"/proc/{started[0].pid}/fd/2").readlink() == Path(os.devnull)
     scans.close()  # type: ignore[attr-defined]
     assert started[0].returncode is not None
     list(read_scans(ouster / "sphere.pcap"))
     assert started[1].returncode is not None
+    next(scans := read_scans(ouster / "sphere.pcap"))
+    monkeypatch.setattr(os, "getpid", lambda: 1)  # as in a child
+    with pytest.raises(PointsError, match=r"sphere\.pcap is read by process \d+; read it anew in its fork"):
+        next(scans)
 
 
 def test_from_threads(ouster: Path) -> None:
