@@ -30,7 +30,7 @@ from .arguments import (
     options,
     positive_number,
 )
-from .output import print_error, print_line, progress
+from .output import make_places, print_error, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Report
 from .scans import (
@@ -229,6 +229,8 @@ def run_command(arguments: argparse.Namespace) -> int:
                 f"--out {arguments.out}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a "
                 "name that is free in one that can be written"
             ) from exc
+    gif = arguments.out / "tracks.gif" if arguments.gif else None
+    make_places(arguments.mcap, arguments.rrd, arguments.play, gif)
     report = Report(arguments, images)
     for folder in found.empty:
         has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
@@ -253,12 +255,11 @@ def run_command(arguments: argparse.Namespace) -> int:
         from ..view.tracks import draw_tracks
 
         try:
-            arguments.out.mkdir(parents=True, exist_ok=True)
             under, mountings = zip(*report.under, strict=True)
-            draw_tracks(report.tracks, arguments.out / "tracks.gif", under=under, mountings=mountings)
+            draw_tracks(report.tracks, gif, under=under, mountings=mountings)
         except OSError as exc:
             n_failed += 1
-            print_error(f"{arguments.out / 'tracks.gif'}: {exc}")
+            print_error(f"{gif}: {exc}")
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived

@@ -286,13 +286,15 @@ class McapSink:
     ------
     MissingExtraError
         foxglove-sdk is not installed.
-    OSError
+    OptionError, OSError
         The file cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
         _sdk(".mcap", "Writing an MCAP file")
         self._path = scene.checked_target(path)
+        if self._path.is_fifo():  # the sizes of what was written are filled in afterwards
+            raise OptionError(f"{path} is a pipe, and an MCAP file is not written in order; expected a file")
         self._channels: _Channels | None = None
 
     def _start(self) -> _Channels:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -661,7 +662,11 @@ def test_no_file_is_written_twice(
 
 def test_wrong_usage(tmp_path: Path, shell: Shell, fake: type[FakePerceiver]) -> None:
     scan = write_scan(tmp_path / "a.bin")
+    (tmp_path / "tracks.gif").mkdir()
     for arguments, words in [
+        (("--play", tmp_path), "is a folder; expected the name of a file"),
+        *[(("--gif", "--track", "--out", tmp_path), "tracks.gif is a folder; expected")]
+        * (find_spec("PIL") is not None),
         (("--png",), "--png needs --out DIR"),
         (("--out", tmp_path / "out"), "add --png"),
         (("--on-mismatch", "explode"), "invalid choice"),

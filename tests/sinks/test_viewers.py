@@ -304,6 +304,10 @@ def test_mcap_refuses_and_keeps_the_old_file(tmp_path: Path) -> None:
     assert target.read_bytes() == b"old"  # a run without an answer
     with pytest.raises(FileNotFoundError, match="folder"):
         McapSink(tmp_path / "absent" / "run.mcap")
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
+        with pytest.raises(OptionError, match="pipe is a pipe"):
+            McapSink(tmp_path / "pipe")
     sink = McapSink(target)
     with pytest.raises(PointsError, match="points and a perception"):
         sink.write(replace(scan, points=scan.points[1:]))
