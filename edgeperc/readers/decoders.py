@@ -338,7 +338,7 @@ def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
                 continue
             if isinstance(message, LidarPackets):
                 _check_unnamed(job.remission_field)
-                turns = turns if isinstance(turns, LidarMessages) else LidarMessages(job.path, message.unit)
+                turns = turns if isinstance(turns, LidarMessages) else LidarMessages(job.path)
                 yield from turns.add(message, stamp_s)
                 continue
             try:

@@ -27,6 +27,7 @@ _VECTOR = [("distance", ">u2"), ("x", ">i2"), ("y", ">i2"), ("z", ">i2"), ("refl
 class MemsFormat(NamedTuple):
     """Packets of one model."""
 
+    name: str
     title: str  # the model, as its maker calls it
     packet: np.dtype[Any]
     ahead: Callable[[NDArray[Any]], Floats]  # of points: their directions, (..., 3)
@@ -47,12 +48,12 @@ def _by_vectors(points: NDArray[Any]) -> Floats:
     return np.stack([points[name] / 32768.0 for name in "xyz"], axis=-1)
 
 
+_OF_M1 = _packet(1210, [("micros", "u1"), ("turn", "u1"), ("points", _ANGLES, 5)], 25)
+_OF_E1 = _packet(1200, [("micros", ">u2"), ("points", _VECTOR, 1)], 96)
 MEMS_FORMATS = MappingProxyType(
     {
-        1210: MemsFormat(
-            "RoboSense M1", _packet(1210, [("micros", "u1"), ("turn", "u1"), ("points", _ANGLES, 5)], 25), _by_angles
-        ),
-        1200: MemsFormat("RoboSense E1", _packet(1200, [("micros", ">u2"), ("points", _VECTOR, 1)], 96), _by_vectors),
+        1210: MemsFormat("rs-m1", "RoboSense M1", _OF_M1, _by_angles),
+        1200: MemsFormat("rs-e1", "RoboSense E1", _OF_E1, _by_vectors),
     }
 )
 """By the bytes of a packet."""

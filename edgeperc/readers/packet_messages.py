@@ -230,15 +230,16 @@ class OusterMessages(_Turns):
 class LidarMessages(_Turns):
     """Scans of a Hesai or RoboSense; what spins has its angles in a file beside the bag, or in a packet of the unit."""
 
-    def __init__(self, path: Path, unit: memoryview | None) -> None:
-        self._path, self._units = path, [] if unit is None else [unit]
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
     def add(self, message: LidarPackets, stamp_s: float) -> Iterator[TimedScan]:
         """The turns that end in a message. Raises PointsError: The angles are not known, or the packets not decoded."""
         from .lidars import stream_of  # numba
 
+        units = [] if message.unit is None else [message.unit]
         for stamp_ns, packet in message.packets:
-            if self._stream is None and (found := stream_of(self._path, packet, self._units)) is not None:
+            if self._stream is None and (found := stream_of(self._path, packet, units)) is not None:
                 self._stream, self._is_of = found
             if self._stream is not None and self._is_of(packet):
                 yield from map(self._of_computer, self._stream.add(packet))

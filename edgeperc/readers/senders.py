@@ -78,8 +78,7 @@ class Senders:
         """`_LIVOX`, or the model of a LiDAR or what one that is not decoded is called; None: not known."""
         format_of, name_of, points_of, mems_format_of = _recognizers()
         if (row := mems_format_of(payload) or format_of(payload)) is not None:
-            self._rows.setdefault(row.title, row)
-            return str(row.title)
+            return str(self._rows.setdefault(row.name, row).name)
         if points_of(payload) is not None:
             return _LIVOX
         # Version 0, length of the packet; 96 points and more.
