@@ -6,6 +6,7 @@ import json
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -278,15 +279,21 @@ def test_packets_of_other_drivers_give_the_turns_of_a_capture(tmp_path: Path, na
             next(iter(read_scans(bare)))
 
 
-@pytest.mark.parametrize("name", LIDARS)
-@given(data=st.data())
-def test_damaged_messages_of_other_drivers(name: str, data: st.DataObject) -> None:
+@cache
+def one_message(name: str) -> tuple[str, list[bytes], bytes]:
+    """Its type, packets and bytes."""
     driver = Driver(name, 2)
     model = MODELS[driver.model]
     packets = packets_of(model, blocks_of(model, *ranges(model, 4 * model.blocks)))[:2]
-    content = bytearray(driver.message(packets[: 1 if not driver.packet.rpartition("/")[2] else 2], 0))
-    read = PACKET_READERS[driver.kind, "cdr"]
-    whole = read(memoryview(bytes(content)))
+    return driver.kind, packets, driver.message(packets[: 1 if not driver.packet.rpartition("/")[2] else 2], 0)
+
+
+@pytest.mark.parametrize("name", LIDARS)
+@given(data=st.data())
+def test_damaged_messages_of_other_drivers(name: str, data: st.DataObject) -> None:
+    kind, packets, sent = one_message(name)
+    content, read = bytearray(sent), PACKET_READERS[kind, "cdr"]
+    whole = read(memoryview(sent))
     assert isinstance(whole, LidarPackets)
     assert [bytes(packet) for _, packet in whole.packets] == packets[: len(whole.packets)]
     for at in data.draw(st.lists(st.integers(0, 60), max_size=4)):
