@@ -83,11 +83,16 @@ def stream_of(
 
     Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
     """
-    if (row := mems_format_of(payload) or format_of(payload)) is not None:
-        return open_stream(path, row, units)
-    if (name := name_of(payload)) is not None:
+    row = _known_format(payload)
+    return None if row is None else open_stream(path, row, units)
+
+
+def _known_format(payload: memoryview) -> Format | MemsFormat | None:
+    """The format of a packet with points; None if it has none. PointsError if it is known, and not decoded."""
+    row: Format | MemsFormat | None = mems_format_of(payload) or format_of(payload)
+    if row is None and (name := name_of(payload)) is not None:
         raise PointsError(not_decoded(name))
-    return None
+    return row
 
 
 def open_stream(
@@ -108,17 +113,14 @@ def is_of(row: Format, payload: memoryview) -> bool:
 
 def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryview | None) -> dict[str, Any]:
     """What packets in messages say about their sensor; see `decoders.describe`."""
-    units = [] if unit is None else [unit]
-    for payload in payloads:
-        if (mems := mems_format_of(payload)) is not None:
-            return {"mems": mems.title}
-        if (found := format_of(payload)) is not None:
-            row, angles = open_spinning(path, found, units)
-            n = columns_of(row, payloads)
-            return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}
-        if (name := name_of(payload)) is not None:
-            raise PointsError(not_decoded(name))
-    raise PointsError("the packets hold no points of a sensor that is known")
+    found = next((row for row in map(_known_format, payloads) if row is not None), None)
+    if found is None:
+        raise PointsError("the packets hold no points of a sensor that is known")
+    if isinstance(found, MemsFormat):
+        return {"mems": found.title}
+    row, angles = open_spinning(path, found, [] if unit is None else [unit])
+    n = columns_of(row, payloads)
+    return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}
 
 
 def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], None]) -> Iterator[TimedScan]:

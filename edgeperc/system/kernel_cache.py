@@ -16,7 +16,7 @@ import logging
 import os
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -82,7 +82,7 @@ def missing(kernels: Iterable[Any]) -> list[Any]:
     """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
     left = {kernel._cache.name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
     for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache.folders()):
-        held = _held(folder) if left and unusable_because(folder) is None else ()
+        held = _held(folder, left) if left and unusable_because(folder) is None else ()
         left = {name: kernel for name, kernel in left.items() if (name, kernel._cache.stamp()) not in held}
     return [*left.values()]
 
@@ -135,7 +135,7 @@ class KernelCache:
 
     def _is_in(self, folder: Path) -> bool:
         """Whether a folder holds a compiled form of this kernel, for any types."""
-        return (self.name, self.stamp()) in _held(folder)
+        return (self.name, self.stamp()) in _held(folder, [self.name])
 
     def flush(self) -> None:
         """Nothing: files of another stamp are replaced when they are met."""
@@ -295,13 +295,14 @@ def _read(file: Path) -> tuple[bytes, bytes] | None:
     return rest[:_DIGEST_BYTES], rest[_DIGEST_BYTES:]
 
 
-def _held(folder: Path) -> set[tuple[str, bytes]]:
-    """Names and stamps of the kernels in a folder, whose files may be damaged; none of what cannot be read."""
+def _held(folder: Path, names: Collection[str]) -> set[tuple[str, bytes]]:
+    """Names and stamps of some kernels in a folder, whose files may be damaged; none of what cannot be read."""
     found = set()
     with suppress(OSError):  # in the home of another user, not even whether there is a folder
         for file in [each for each in folder.iterdir() if each.suffix == ".kernel"]:
-            with suppress(OSError), file.open("rb") as opened:
-                found.add((file.name.rpartition("-")[0], opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]))
+            if (name := file.name.rpartition("-")[0]) in names:
+                with suppress(OSError), file.open("rb") as opened:
+                    found.add((name, opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]))
     return found
 
 
