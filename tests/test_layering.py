@@ -76,7 +76,7 @@ FLOORS = {
         readers.__init__ readers.origin readers.pcap readers.times readers.unknown
         readers.clouds readers.images readers.ouster readers.packets readers.tables
         readers.alternation readers.livox_packets readers.mems_packets readers.ouster_packets readers.spinning_packets
-        readers.inflate readers.pcd readers.ply readers.raw readers.senders
+        readers.inflate readers.mirror_packets readers.pcd readers.ply readers.raw readers.senders
         readers.lidars readers.mcap readers.text
         readers.bags readers.files readers.packet_messages
         readers.decoders

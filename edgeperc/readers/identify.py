@@ -89,8 +89,8 @@ def of_livox() -> NotSpinningError:
     )
 
 
-def of_mems(title: str) -> SensorError:
-    """What to say of sensors whose mirror sweeps: they have no beams of one elevation."""
+def of_mirrors(title: str) -> SensorError:
+    """What to say of sensors whose mirrors sweep: they have no beams of one elevation."""
     return SensorError(f"the packets are of a {title}, of which no profile is built in. {_CHOICES}")
 
 
@@ -104,10 +104,10 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
     if lidar.row is None:
         raise of_livox()
     from .lidars import columns_of, open_spinning, payloads_of  # numba
-    from .mems_packets import MemsFormat
+    from .spinning_packets import Format
 
-    if isinstance(lidar.row, MemsFormat):
-        raise of_mems(lidar.row.title)
+    if not isinstance(lidar.row, Format) or not lidar.row.spins:
+        raise of_mirrors(lidar.row.title)
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
     row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None))

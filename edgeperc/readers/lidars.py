@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import PointsError
 from .livox_packets import LivoxStream, points_of
 from .mems_packets import MemsFormat, MemsStream, mems_format_of
+from .mirror_packets import MirrorStream, read_mirrors
 from .packets import Datagrams
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
@@ -31,16 +32,14 @@ from .times import TimedScan
 
 _STEPS = 200  # packets that show how far apart columns are
 _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
+Opened = tuple[SpinningStream | MemsStream | MirrorStream, Callable[[memoryview], bool]]
 
 
 def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tuple[Format, Angles]:
     """The format and angles of a spinning sensor; PointsError if neither its packets nor a file beside the capture has
     them.
     """
-    files = sorted(path.absolute().parent.glob("*.csv"))
-    # Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture.
-    own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
-    file = min(own, key=lambda each: len(each.stem), default=None)
+    file = _file_of(path, ".csv")
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
     for payload in () if row.is_hesai else payloads:
         if row.name == "helios-32" and angles_of_difop(FORMATS["helios-16"], payload) is not None:
@@ -60,6 +59,13 @@ def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tu
     return row, said
 
 
+def _file_of(path: Path, suffix: str) -> Path | None:
+    """Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture."""
+    files = sorted(path.absolute().parent.glob(f"*{suffix}"))
+    own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
+    return min(own, key=lambda each: len(each.stem), default=None)
+
+
 def columns_of(row: Format, payloads: Iterable[memoryview]) -> int:
     """How many columns a turn has, by the azimuths of the first packets; 0 if they do not show it."""
     stream, azimuths = SpinningStream(row, Angles(np.zeros((128, 2)))), list[float]()
@@ -76,9 +82,7 @@ def payloads_of(path: Path, sender: str | None, alive: Callable[[], None]) -> It
     return (datagram.payload for datagram in Datagrams(path, alive) if datagram.is_from(sender))
 
 
-def stream_of(
-    path: Path, payload: memoryview, units: Iterable[memoryview]
-) -> tuple[SpinningStream | MemsStream, Callable[[memoryview], bool]] | None:
+def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview]) -> Opened | None:
     """`open_stream` of a sensor that sends such packets; None if it has no points.
 
     Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
@@ -95,12 +99,18 @@ def _known_format(payload: memoryview) -> Format | MemsFormat | None:
     return row
 
 
-def open_stream(
-    path: Path, row: Format | MemsFormat, units: Iterable[memoryview]
-) -> tuple[SpinningStream | MemsStream, Callable[[memoryview], bool]]:
+def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview]) -> Opened:
     """What makes scans of the packets of a format, and tells them from others; PointsError as of `open_spinning`."""
     if isinstance(row, MemsFormat):
         return MemsStream(row), lambda payload: mems_format_of(payload) is row
+    if not row.spins:
+        file = _file_of(path, ".dat")
+        if file is None:
+            raise PointsError(
+                f"where the lasers of this {row.title} look is not known. Put the correction file of the unit beside "
+                f"it, as {path.stem}.dat"
+            )
+        return MirrorStream(row, read_mirrors(file)), partial(is_of, row)
     found, angles = open_spinning(path, row, units)
     return SpinningStream(found, angles), partial(is_of, found)
 
@@ -116,8 +126,8 @@ def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryvie
     found = next((row for row in map(_known_format, payloads) if row is not None), None)
     if found is None:
         raise PointsError("the packets hold no points of a sensor that is known")
-    if isinstance(found, MemsFormat):
-        return {"mems": found.title}
+    if isinstance(found, MemsFormat) or not found.spins:
+        return {"mirrors": found.title}
     row, angles = open_spinning(path, found, [] if unit is None else [unit])
     n = columns_of(row, payloads)
     return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}

@@ -31,6 +31,7 @@ class MemsFormat(NamedTuple):
     title: str  # the model, as its maker calls it
     packet: np.dtype[Any]
     ahead: Callable[[NDArray[Any]], Floats]  # of points: their directions, (..., 3)
+    spins: bool = False  # as of `spinning_packets.Format`
 
 
 def _packet(size: int, block: list[Any], n_blocks: int) -> np.dtype[Any]:

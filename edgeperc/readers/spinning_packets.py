@@ -54,6 +54,7 @@ class Format(NamedTuple):
     lens_m: tuple[float, float] = (0.0, 0.0)  # distance of the lasers from the axis, and height
     lasers: int = 0  # 16: channels beyond are a second firing or return; 96: every second block has those beyond 48
     elevations_deg: tuple[float, ...] = ()  # of every unit; empty: each unit has its own angles
+    spins: bool = True  # or its mirrors do alone
 
     @property
     def is_hesai(self) -> bool:
@@ -90,6 +91,11 @@ def _xt(name: str, elevations: Sequence[float], fires_us: Iterable[float], n_blo
 
 
 _NO_FIRES = (0.0,) * 128
+_AT_NS = (0, 848, 2504, 4112, 4144, 4976, 6616, 8240, 8264, 9112, 10768, 12376, 12424, 13280, 14928)
+_AT_LASERS = (
+    "00734700c438bb8c00374004c83bbc812566921add59eea21659612da5de9aed"
+    "19d2512eaae56691dd95221aeea65963c0400c0834778bbc3400000c87487bb8"
+)
 _OLD, _DATE, _SECONDS = b"\xff\xee", Clock("date", 20), Clock("seconds", 20)
 _RUBY = "000112222333444555666778899aabbccddeefff000111222334444556667778899aabbbccdeefff"  # firings of 80 channels
 # Of eight channels each.
@@ -110,6 +116,9 @@ _FORMATS = (
            _tail(788, 15, 21, 13), reference=-1, mm_at=9),
     Format("qt128", "Hesai QT128C2X", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
            _tail(788, 15, 21, 13), reference=-1, late_us=9.0, mm_at=9),
+    # Its `mirror_packets`; 4 bytes more for a number of the packet, 32 for a signature.
+    Format("at128", "Hesai AT128", 12, 2, 128, 4, (1082, 1086, 1114, 1118), b"", 3,
+           tuple(1e-3 * _AT_NS[int(each, 16)] for each in _AT_LASERS), _tail(1046, 26, 20, 18), mm_at=9, spins=False),
     Format("rs-16", "RoboSense RS-LiDAR-16", 42, 12, 32, 3, (1248,), _OLD, 4,
            tuple(2.8 * (k % 16) + 55.5 * (k // 16) for k in range(32)), _DATE, unit_m=0.005, lens_m=(0.03977, 0.0),
            lasers=16),
@@ -149,6 +158,7 @@ _HESAI = {
     (3, 1, 64, 4): "pandarqt-64",
     (1, 4, 128, 2): "ot128",
     (3, 2, 128, 2): "qt128",
+    (4, 3, 128, 2): "at128",
 }
 _HESAI_NAMES = {
     (4, 3): "AT128",
@@ -374,7 +384,7 @@ class SpinningStream:
         speed_at = row.clock.speed_at
         rpm = float(struct.unpack_from("<H", payload, speed_at)[0]) if speed_at else self._angles.rpm
         is_likely = _SPEEDS[0] <= rpm <= _SPEEDS[1]
-        return _Packet(bytes(payload), _time_of(row, payload), rpm if is_likely else 600.0, azimuths)
+        return _Packet(bytes(payload), time_of(row, payload), rpm if is_likely else 600.0, azimuths)
 
     def _turn(self, packet: _Packet, begin: int, end: int) -> Iterator[TimedScan]:
         """The packets so far and some blocks of another one; nothing, if there is no block among them."""
@@ -430,7 +440,7 @@ def _beams(row: Format, angles: Angles, is_dual: bool) -> Floats:
     return np.stack([np.radians(elevation), azimuth, fires_us], axis=-1)
 
 
-def _time_of(row: Format, payload: memoryview) -> float:
+def time_of(row: Format, payload: memoryview) -> float:
     """The time that a packet states [s]."""
     kind, at, micros_at, _ = row.clock
     if kind == "seconds":

@@ -6,12 +6,24 @@ import json
 from typing import Any
 
 import numpy as np
-from lidar_writers import MODELS, blocks_of, calibration, difop, livox_packets, packets_of, ranges, unit_angles
+from lidar_writers import (
+    MODELS,
+    at128_correction,
+    at128_packets,
+    blocks_of,
+    calibration,
+    difop,
+    livox_packets,
+    packets_of,
+    ranges,
+    unit_angles,
+)
 from numpy.typing import NDArray
 from test_ouster_packets import ANGLES, changed
 
 from edgeperc.errors import PointsError
 from edgeperc.readers.livox_packets import LivoxStream, fill_points, points_of
+from edgeperc.readers.mirror_packets import Mirrors, MirrorStream, read_mirrors
 from edgeperc.readers.ouster_packets import PROFILES, OusterStream, fill_turn, layout_of
 from edgeperc.readers.spinning_packets import (
     FORMATS,
@@ -32,7 +44,7 @@ LIMIT_S, LIMIT_MB = 5.0, 1500.0
 N_PACKETS = 100
 THROUGH_STREAM = 10  # of them
 LIVOX = [(1, False), (2, False), (3, False), (0x11, False), (0, True), (1, True), (2, True), (3, True), (4, True)]
-DECODERS = ["ouster", "livox", *MODELS]
+DECODERS = ["ouster", "livox", "at128", *MODELS]
 
 
 def damaged(packet: bytes, rng: np.random.Generator, n: int = N_PACKETS) -> NDArray[np.uint8]:
@@ -65,6 +77,8 @@ class Packets:
             row = format_of(memoryview(packet))
             assert row is not None
             self.spinning[name] = (row if name == "ot128" else FORMATS[name], Angles(unit_angles(model)), packet)
+        blocks = np.full((2, 128), 7)
+        self.mirrors = at128_packets([0, 9 * 10**6], blocks, blocks)[0]
         for decoder in DECODERS:  # compiles
             self.decode(Case("packets", 0, 0, None, np.random.default_rng(0)), decoder)  # type: ignore[arg-type]
 
@@ -77,7 +91,20 @@ class Packets:
     def decode(self, case: Case, decoder: str) -> int:
         if decoder == "ouster":
             return self.of_ouster(case)
+        if decoder == "at128":
+            return self.of_mirrors(case)
         return self.of_livox(case) if decoder == "livox" else self.of_spinning(case, decoder)
+
+    def of_mirrors(self, case: Case) -> int:
+        """With a correction of any numbers that a file can hold."""
+        words = case.rng.integers(-(2**31), 2**31, (2, 128 + 2))
+        begins, ends = case.pick([words[:, :2], np.array([[0, 5 * 10**6], [5 * 10**6, 9 * 10**6]])])
+        off = 255 * 256 * case.rng.integers(-128, 128, (2, 128, 180))
+        stream = MirrorStream(FORMATS["at128"], Mirrors(begins, ends, words[:, 2:], off))
+        table = [memoryview(each.tobytes()) for each in damaged(self.mirrors, case.rng)[:THROUGH_STREAM]]
+        scans = [scan for each in table if format_of(each) is FORMATS["at128"] for scan in stream.add(each)]
+        check_scans([*scans, *stream.end()])
+        return sum(len(scan.points) for scan in scans)
 
     def of_ouster(self, case: Case) -> int:
         _, layout, packet = case.pick(self.ouster)
@@ -132,6 +159,8 @@ class Packets:
         """What says how packets are read: metadata, calibrations, and RoboSense's other packets."""
         model = case.pick([*MODELS.values()])
         case.folder.joinpath("a.csv").write_bytes(mutated_bytes(calibration(unit_angles(model)).encode(), case, 6))
+        correction = at128_correction([0], [10**6], np.zeros((2, 128), np.int64), np.zeros((2, 128, 180), np.int8))
+        case.folder.joinpath("a.dat").write_bytes(mutated_bytes(correction, case, 6))
         content, *_ = case.pick(self.ouster)
         document = mutated_json(content, case)
         case.evidence["metadata.json"] = document
@@ -142,6 +171,7 @@ class Packets:
         outcomes = []
         for read in (
             lambda: read_angles(case.folder / "a.csv", FORMATS[model.name]),
+            lambda: read_mirrors(case.folder / "a.dat"),
             lambda: OusterStream(layout_of(json.loads(document)), None),
         ):
             try:

@@ -260,6 +260,35 @@ def mems_packets(
     return packets
 
 
+def at128_correction(
+    begins: Sequence[int], ends: Sequence[int], lasers: NDArray[np.int64], off: NDArray[np.int8], resolution: int = 1
+) -> bytes:
+    """Version 1.5: (2, 128) azimuths and elevations in 25,600ths of a degree, (2, 128, 180) hundredths off them."""
+    content = bytes((0xEE, 0xFF, 1, 5, 128, len(begins), len(begins))) + bytes(8) + bytes([resolution])
+    return (
+        content + struct.pack(f"<{2 * len(begins)}I", *begins, *ends) + lasers.astype("<i4").tobytes() + off.tobytes()
+    )
+
+
+def at128_packets(
+    motor: Sequence[int], units: NDArray[np.int64], remission: NDArray[np.int64], *, numbered: bool = True
+) -> list[bytes]:
+    """Of Hesai's AT128: two blocks a packet, each with the angle of the motor [1/25600 deg]; one every 83.332 us."""
+    packets = []
+    for k in range(0, len(motor) - 1, 2):
+        content = bytes((0xEE, 0xFF, 4, 3, 0, 0, 128, 2, 0, 4, 1, 0x10 | numbered))
+        for b in (k, k + 1):
+            content += struct.pack("<HB", *divmod(motor[b], 256))
+            content += b"".join(
+                struct.pack("<HBB", *each, 9) for each in zip(units[b].tolist(), remission[b].tolist(), strict=True)
+            )
+        nanos = 41_666 * k
+        content += bytes(4) + bytes(18) + struct.pack("<hIBB", 200, nanos // 1000, 0x37, 0x42)
+        content += bytes(2) + T0_S.to_bytes(4, "big") + bytes(8 if numbered else 4)
+        packets.append(content)
+    return packets
+
+
 def lvx2_file(packets: Sequence[bytes], serials: Sequence[str] = ("47MDL01",)) -> bytes:
     """The packets of the new protocol in frames of 50 ms; each sensor has all of them."""
     content = b"livox_tech".ljust(16, b"\0") + bytes((2, 0, 0, 0)) + struct.pack("<IIB", 0xAC0EA767, 50, len(serials))

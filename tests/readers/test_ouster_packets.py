@@ -270,7 +270,7 @@ def test_a_sensor_beside_an_ouster_is_named_however_few_its_packets_are(
     assert len(list(read_timed_scans(path, topic="10.0.0.9"))) > 0
 
 
-@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "livox", "Hesai AT128"])
+@pytest.mark.parametrize("name", ["pandarxt-16", "pandarxt-32", "livox", "Hesai ATX"])
 def test_a_sensor_that_begins_late_beside_an_ouster_is_warned_of(tmp_path: Path, name: str) -> None:
     ousters = [bytes(packet.buf) for turn in random_packets(METADATA, 64, 1) for packet in turn]
     path = joined(tmp_path, [(ousters, "10.0.0.1:7502"), (other_packets(name), "10.0.0.9")])
@@ -299,8 +299,8 @@ def test_damaged_numbers_are_no_other_ouster(tmp_path: Path, n: int) -> None:
 
 def other_packets(name: str) -> list[bytes]:
     """Of a sensor of another maker."""
-    if name == "Hesai AT128":
-        return [bytes.fromhex("eeff0403000080020004017f") + bytes([k]) + bytes(1105) for k in range(80)]
+    if name == "Hesai ATX":
+        return [bytes.fromhex("eeff0407000080020004017f") + bytes([k]) + bytes(1105) for k in range(80)]
     if name == "livox":
         return livox_packets(1, np.full((96 * 300, 3), 7.5), np.arange(96 * 300) % 256, is_old=False)
     model = MODELS[name]

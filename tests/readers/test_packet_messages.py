@@ -312,11 +312,11 @@ def test_a_velodynes_packets_of_nebula_are_a_velodynes(tmp_path: Path) -> None:
 
 
 def test_a_sensor_that_is_not_decoded_is_named(tmp_path: Path) -> None:
-    packet = bytes((0xEE, 0xFF, 4, 3, 0, 0, 128, 2, 0, 4, 1, 0)).ljust(1118, b"\0")
+    packet = bytes((0xEE, 0xFF, 4, 7, 0, 0, 128, 2, 0, 4, 1, 0)).ljust(1118, b"\0")
     driver = Driver("hesai_ros_driver", 2)
     path = mcap_of(tmp_path / "a.mcap", [(PACKETS, driver.kind, "cdr", [driver.message([packet], 0)])])
     for call in (lambda: next(iter(read_scans(path))), lambda: sensor_of(path)):
-        with pytest.raises(PointsError, match="a capture of a Hesai AT128, which cannot be decoded"):
+        with pytest.raises(PointsError, match="a capture of a Hesai ATX, which cannot be decoded"):
             call()
 
 

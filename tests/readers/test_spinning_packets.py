@@ -203,7 +203,8 @@ def test_a_sensor_that_begins_late_is_left_out_with_a_warning(tmp_path: Path, na
 
 
 OTHERS = [
-    ("Hesai AT128", bytes.fromhex("eeff0403000080020004017f") + bytes(1106)),
+    ("Hesai JT", bytes.fromhex("eeff01080000") + bytes(800)),
+    ("Hesai ATX", bytes.fromhex("eeff0407000080020004017f") + bytes(1106)),
     ("Hesai QT128", bytes.fromhex("eeff03020000800300040107") + bytes(1115)),
     ("Hesai XT", bytes.fromhex("eeff06010000200500040101") + bytes(808)),
     ("Hesai Pandar20", b"\xee\xff\x14\x14\0\x04" + bytes(1264)),

@@ -1,0 +1,131 @@
+"""Packets of Hesai's AT128: its mirrors turn, and what one of them sweeps is a frame.
+
+A block has the angle of the motor. The correction file of the unit says where each mirror begins and ends, and where
+each laser looks. Angles are in 1/256 of a hundredth of a degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import PointsError
+from ..types.points import Bytes, Floats, Ints64
+from .spinning_packets import Format, time_of
+from .times import TimedScan
+
+_DEGREE = 25_600
+_N_LASERS, _N_STEPS, _STEP = 128, 180, 2 * _DEGREE  # a correction every two degrees of the motor
+_MOST_MIRRORS = 8
+_MOST_PACKETS = 10_000  # of a frame, which has 600; 1,200 with two returns
+_BLOCK_US, _LATE_US = 41.666, 50.915  # from block to block, and from the last block to the time of the packet
+
+
+class Mirrors(NamedTuple):
+    """A unit's correction file: the motor's angle where each mirror begins and ends, (2, lasers) azimuth and elevation,
+    and how far they are off at each step of the motor, (2, lasers, steps).
+    """
+
+    begins: Ints64
+    ends: Ints64
+    lasers: Ints64
+    off: Ints64
+
+    def at(self, motor: Ints64) -> Ints64:
+        """Which mirror is in front of the lasers at these angles of the motor; -1: none."""
+        turn = 360 * _DEGREE
+        is_in = (motor[..., None] - self.begins) % turn <= (self.ends - self.begins) % turn
+        return np.where(is_in.any(-1) & (motor < turn), is_in.argmax(-1), -1)
+
+
+def read_mirrors(path: Path) -> Mirrors:
+    """Raises PointsError: It is not the correction file of an AT128, of version 1.5."""
+    content = path.read_bytes()[: 1 << 20]
+    begin = max(content.find(b"\xee\xff"), 0)
+    head = content[begin : begin + 16].ljust(16, b"\0")
+    n, resolution = head[6], head[15]
+    size = 16 + 8 * n + 8 * _N_LASERS + 2 * _N_LASERS * _N_STEPS
+    rest = content[begin + 16 : begin + size]
+    known = b"\xee\xff\1\5" + bytes([_N_LASERS])
+    if not (head.startswith(known) and 0 < n <= _MOST_MIRRORS and resolution):
+        raise PointsError(
+            f"{path.name} is not a correction file of a Hesai AT128: it begins with {head.hex(' ')}; expected "
+            f"{known.hex(' ')} for version 1.5 and 128 lasers, 1 to {_MOST_MIRRORS} mirrors and a resolution"
+        )
+    if len(rest) != size - 16:
+        raise PointsError(f"{path.name} has {len(content):,} bytes of {begin + size:,}; it is cut short")
+    words, off = np.frombuffer(rest[: 8 * (n + _N_LASERS)], "<i4"), np.frombuffer(rest[8 * (n + _N_LASERS) :], np.int8)
+    angles = resolution * words.astype(np.int64)
+    steps = 256 * resolution * off.astype(np.int64).reshape(2, _N_LASERS, _N_STEPS)
+    return Mirrors(angles[:n], angles[n : 2 * n], angles[2 * n :].reshape(2, _N_LASERS), steps)
+
+
+class MirrorStream:
+    """Frames from the packets of an AT128."""
+
+    def __init__(self, row: Format, mirrors: Mirrors) -> None:
+        self._row, self._mirrors = row, mirrors
+        self._packets, self._mirror, self._size = list[bytes](), -1, 0
+
+    def add(self, payload: memoryview) -> Iterator[TimedScan]:
+        """The frames that end in a packet of the format: where another mirror begins. All have the size of the first;
+        others are left out.
+        """
+        self._size = self._size or len(payload)
+        if len(payload) != self._size:
+            return
+        content = bytes(payload)
+        for mirror in dict.fromkeys(self._mirrors.at(self._motor([content]))[0].tolist()):
+            if mirror < 0:
+                continue
+            if mirror != self._mirror or len(self._packets) >= _MOST_PACKETS:
+                yield from self.end()
+            self._mirror = mirror
+            self._packets.append(content)
+
+    def end(self) -> Iterator[TimedScan]:
+        """The last frame, which may be a part."""
+        packets, self._packets = self._packets, []
+        if not packets:
+            return
+        motor = self._motor(packets)
+        is_second = (motor[:, 1] == motor[:, 0])[:, None]  # of two returns
+        returns = self._blocks(packets)[..., 3:].reshape(*motor.shape, _N_LASERS, 4)
+        units = returns[..., 0].astype(np.int64) | returns[..., 1].astype(np.int64) << 8
+        units[:, 1][is_second & (units[:, 1] == units[:, 0])] = 0
+        late_us = np.where(is_second, [0.0, 0.0], [_BLOCK_US, 0.0]) + _LATE_US
+        times_s = np.array([time_of(self._row, memoryview(each)) for each in packets])[:, None] - 1e-6 * late_us
+        fired_s = times_s[..., None] + 1e-6 * np.array(self._row.fires_us)
+        shown = (units > 0) & (self._mirrors.at(motor) == self._mirror)[..., None]
+        p, b, laser = np.nonzero(shown)
+        azimuth, elevation = self._directions(motor[p, b], laser)
+        ranges = 1e-3 * packets[0][self._row.mm_at] * units[shown]
+        flat = ranges * np.cos(elevation)
+        values = (flat * np.sin(azimuth), flat * np.cos(azimuth), ranges * np.sin(elevation), returns[..., 2][shown])
+        scan = np.stack(values, axis=1).astype(np.float32)
+        yield TimedScan(float(fired_s[shown].max() if len(p) else times_s[0, 1]), scan, fired_s[shown])
+
+    def _blocks(self, packets: list[bytes]) -> Bytes:
+        """(n, blocks, bytes)."""
+        row = self._row
+        content = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), -1)
+        body = content[:, row.header : row.header + row.n_blocks * row.block_bytes]
+        return body.reshape(len(packets), row.n_blocks, row.block_bytes)
+
+    def _motor(self, packets: list[bytes]) -> Ints64:
+        """(n, blocks) its angle."""
+        low, high, fine = np.moveaxis(self._blocks(packets)[..., :3].astype(np.int64), -1, 0)
+        return (high << 8 | low) * 256 + fine
+
+    def _directions(self, motor: Ints64, laser: Ints64) -> Floats:
+        """(2, n) azimuth and elevation [rad]; a mirror turns a ray by twice its own angle."""
+        step, rest = np.divmod(motor, _STEP)
+        share = rest / _STEP
+        near, far = (self._mirrors.off[:, laser, (step + k) % _N_STEPS] for k in (0, 1))
+        off = (1.0 - share) * near + share * far
+        swept = 2 * (motor - self._mirrors.begins[self._mirror])
+        azimuth, elevation = self._mirrors.lasers[:, laser]
+        return np.radians(np.stack([swept - azimuth, elevation]) + off) / _DEGREE
