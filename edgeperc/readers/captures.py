@@ -16,7 +16,7 @@ from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
-from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_mirrors, of_packets, of_spinning, of_velodyne
+from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_model, of_packets, of_spinning, of_velodyne
 from .packets import capture_kind
 from .times import TimedScan, accumulate
 from .unknown import advice_for, missing
@@ -235,8 +235,8 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
             return of_metadata(json.loads(description["metadata"]), "the metadata")
         if "velodyne" in description:
             return of_velodyne(description["velodyne"])
-        if "mirrors" in description:
-            raise of_mirrors(description["mirrors"])
+        if "model" in description:
+            return of_model(description["model"])
         if "spinning" in description:
             return of_spinning(description["spinning"], description["lasers_deg"], description["columns"])
         return of_cloud(description)

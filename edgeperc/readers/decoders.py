@@ -90,7 +90,7 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
     Returns: ``metadata`` of an Ouster, as text; ``velodyne``, the names in its packets; ``spinning``, the format of
-        Hesai's or RoboSense's packets, ``lasers_deg`` and ``columns``; ``mirrors``, the model of one whose mirrors
+        Hesai's or RoboSense's packets, ``lasers_deg`` and ``columns``; ``model``, that of one whose mirrors
         sweep; or ``topic``, ``frame``, ``fields`` and ``elevations_deg`` of a point cloud: the median elevation of each
         ring or, without rings, of each row of an organized cloud [deg], None where a ring has no return; empty without
         both.

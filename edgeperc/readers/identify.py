@@ -89,11 +89,6 @@ def of_livox() -> NotSpinningError:
     )
 
 
-def of_mirrors(title: str) -> SensorError:
-    """What to say of sensors whose mirrors sweep: they have no beams of one elevation."""
-    return SensorError(f"the packets are of a {title}, of which no profile is built in. {_CHOICES}")
-
-
 def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) -> KnownSensor | None:
     """The sensor of Hesai's or RoboSense's packets, with the angles of the unit; None if they are not theirs, or if it
     is ``beside`` a Velodyne and the topic does not name it.
@@ -107,7 +102,7 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
     from .spinning_packets import Format
 
     if not isinstance(lidar.row, Format) or not lidar.row.spins:
-        raise of_mirrors(lidar.row.title)
+        return of_model(lidar.row.name)
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
     row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None))
@@ -126,11 +121,16 @@ def of_spinning(name: str, lasers_deg: Sequence[Sequence[float]], columns: int) 
     return KnownSensor(replace(profile, elevations_deg=elevations, columns=columns or profile.columns), because)
 
 
+def of_model(name: str) -> KnownSensor:
+    """The sensor of packets that name the model of a built-in profile."""
+    return KnownSensor(SENSORS[name], "named by the packets")
+
+
 def of_velodyne(names: Collection[str | None]) -> KnownSensor:
     """The sensor of a Velodyne's packets, by the names in them (`packets.velodyne_name`)."""
     name = ", ".join(sorted(map(str, names)))
     if name in SENSORS:
-        return KnownSensor(SENSORS[name], "named by the packets")
+        return of_model(name)
     if {*names} == {None}:
         raise SensorError(f"the packets are a Velodyne's but do not name the model. {_CHOICES}")
     raise SensorError(f"the packets are of a Velodyne {name}, of which no profile is built in. {_CHOICES}")

@@ -127,7 +127,7 @@ def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryvie
     if found is None:
         raise PointsError("the packets hold no points of a sensor that is known")
     if isinstance(found, MemsFormat) or not found.spins:
-        return {"mirrors": found.title}
+        return {"model": found.name}
     row, angles = open_spinning(path, found, [] if unit is None else [unit])
     n = columns_of(row, payloads)
     return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}

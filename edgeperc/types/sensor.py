@@ -424,6 +424,15 @@ def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: fl
 _BYTE = (0.0, 255.0)
 
 
+def _mirrors(
+    name: str, n_lines: int, fov_deg: tuple[float, float], step_deg: float, max_range_m: float
+) -> SensorProfile:
+    columns = round(360.0 / step_deg)
+    return SensorProfile.uniform(
+        name, n_lines, *fov_deg, columns=columns, remission_range=_BYTE, max_range_m=max_range_m
+    )
+
+
 def _livox(
     name: str, fov_deg: tuple[float, float], pattern: ScanPattern, min_range_m: float, max_range_m: float
 ) -> SensorProfile:
@@ -466,6 +475,10 @@ _BUILT_IN = (
     *_ouster("os2", 11.25, 0.8, 350.0),
     SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, min_range_m=0.3, max_range_m=200.0, remission=_OF_PANDASET),
     SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
+    # Mirrors sweep the lasers over 120 degrees ahead; by the makers' manuals.
+    _mirrors("at128", 128, (12.9, -12.5), 0.1, 210.0),
+    _mirrors("rs-m1", 125, (12.5, -12.5), 0.2, 200.0),
+    _mirrors("rs-e1", 144, (45.0, -45.0), 0.625, 75.0),
     # By the maker's manuals. How fast their prisms turn is not in them; one beam turns here so fast that its lines are
     # as dense as those of the several beams in the sensor.
     _livox("mid-360", (52.0, -7.0), ScanPattern(200_000.0, 360.0, 0.2, (9.7, 1733.3)), 0.1, 70.0),

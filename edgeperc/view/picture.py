@@ -292,7 +292,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         first = 0 if arrow is None else len(labels)  # without an arrow, no other panel says it
         labels.insert(first, canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = canvas.place_labels(axes, labels, avoid)
-    seen = f"scores; {n_farther} farther" if n_farther else "scores"
+    seen = f"{n_farther} farther" if n_farther else "scores"
     seen = _omitted(seen, n_omitted) if n_omitted else f"{seen}; gray: not observed"  # all is wider than the panel
     canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
     return float(axes.get_window_extent().width)

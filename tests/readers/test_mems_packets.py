@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from lidar_writers import T0_S, mems_packets
 from test_packet_messages import mcap_of
 
-from edgeperc import SensorError, read_timed_scans, sensor_of
+from edgeperc import read_timed_scans, sensor_of
 from edgeperc.readers.mems_packets import MemsStream, mems_format_of
+from edgeperc.types.sensor import SENSORS
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -70,8 +71,7 @@ def test_what_is_written_is_read(tmp_path: Path, name: str) -> None:
     bag = mcap_of(tmp_path / "a.mcap", [("/packets", "rslidar_msg/msg/RslidarPacket", "cdr", sent)], 900_000)
     assert check_same(read_timed_scans(bag), scans, clock=False) == 3
     for source in (path, bag):
-        with pytest.raises(SensorError, match=f"the packets are of a RoboSense {name.upper()}, of which no profile"):
-            sensor_of(source)
+        assert sensor_of(source) is SENSORS[f"rs-{name}"]
 
 
 @pytest.mark.parametrize("name", PER_PACKET)

@@ -180,7 +180,7 @@ def test_a_turn_of_few_beams_has_no_stripes_and_boxes_outside_are_counted(
     turn = replace(perception, n_points=len(scan), points=points, boxes=(CAR, far))
     picture = pixels(view.draw(turn, scan))
     assert not near(picture[720:850, 760:1560], PANEL).any()
-    assert headings[0] == "scores; 1 farther; gray: not observed"
+    assert headings[0] == "1 farther; gray: not observed"
 
 
 @pytest.mark.parametrize("is_free", [False, True])
