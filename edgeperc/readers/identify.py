@@ -30,7 +30,7 @@ _MAKERS = {
     "hesai": r"hesai|pandar",
 }
 # First letters of the profiles of each maker.
-_PREFIXES = {"velodyne": ("hdl", "vlp"), "ouster": ("os",), "hesai": ("pandar",)}
+_PREFIXES = {"velodyne": ("hdl", "vlp"), "ouster": ("os",), "hesai": ("pandar", "at")}
 
 # Between the median elevation of the rings of a scan and those of the profile of their sensor [deg]. Units differ by up
 # to 1.4 from the profile, models with the same number of beams by 3 and more.
