@@ -17,6 +17,7 @@ from typing import Any, Literal
 from .errors import EdgepercError, OptionError, PointsError, StampError
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
+from .readers.ports import is_port
 from .readers.times import TimedScan, accumulate
 from .system.clock import LATEST_S, Clock, as_seconds
 from .types.perception import Perception
@@ -85,7 +86,8 @@ def stream(
         Either an iterable of scans, each as points or as a tuple (stamp_s, points). A thread reads it as fast as
         possible; the source must not change a scan afterwards. Or the path of a scan, a folder or a capture
         (`edgeperc.read_scans`), replayed in real time: by its stamps or, without stamps, at ``rate_hz``. A step back in
-        its stamps, or a pause of more than 2 s or 5 periods of the sensor, is replayed as one period.
+        its stamps, or a pause of more than 2 s or 5 periods of the sensor, is replayed as one period. Or ports to which
+        a sensor sends its packets, ``udp:2368``.
     perceiver : callable
         ``perceiver(points, stamp_s=stamp_s) -> Perception``, such as a `Perceiver`.
     tracker : callable, optional
@@ -135,7 +137,7 @@ def stream(
     if isinstance(source, str | os.PathLike):
         _warn_of_another_sensor(source, perceiver, topic)
         read = read_scans(Path(source), topic=topic, accumulate_s=accumulate_s)
-        scans: Iterator[Any] = paced(read, rate_hz, inbox.stopped)
+        scans: Iterator[Any] = read if is_port(Path(source)) else paced(read, rate_hz, inbox.stopped)
     else:
         try:
             scans = iter(source)

@@ -101,8 +101,8 @@ def add_parser(commands: Commands) -> None:
         "paths PATH...",
         "scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .pcapng, .osf, .bag, .mcap, a ROS 2 bag's folder "
-        "(extras 'velodyne', 'bags', and 'ouster' for .osf); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of "
-        "them (extra 'camera')",
+        "(extras 'velodyne', 'bags', and 'ouster' for .osf); ports to which a sensor sends its packets (udp:2368); or "
+        "images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra 'camera')",
         type=location,
     )
     reading(
@@ -178,7 +178,11 @@ def add_parser(commands: Commands) -> None:
     )
     tracking("--gif", "write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'")
     live = options(parser, "live")
-    live("--live", "replay one PATH in real time; always take the newest scan and drop older ones that still wait")
+    live(
+        "--live",
+        "replay one PATH in real time; always take the newest scan and drop older ones that still wait (default for "
+        "ports, if no files are written)",
+    )
     live("--rate HZ", "scans per second of files without time stamps (default: 10)", type=positive_number, default=10.0)
 
 
@@ -205,7 +209,11 @@ def make_perceiver(
 
 def run_command(arguments: argparse.Namespace) -> int:
     """Perceive scans; return 1 if some failed."""
+    from ..readers.ports import is_port
+
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
+    # What comes at a port is a live source, unless every scan is wanted.
+    arguments.live |= any(map(is_port, arguments.paths)) and not (kinds or arguments.gif or arguments.deskew)
     _check_usage(arguments, kinds)
     images = _images(arguments, kinds)
     given = [*images] or ([_live_source(arguments)] if arguments.live else [])

@@ -18,6 +18,7 @@ from .bags import bag_files
 from .files import FileOptions, read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_livox, of_metadata, of_model, of_packets, of_spinning, of_velodyne
 from .packets import capture_kind
+from .ports import is_port, release
 from .times import TimedScan, accumulate
 from .unknown import advice_for, missing
 
@@ -50,7 +51,9 @@ def read_scans(
         ``.mcap`` file. Bags are read for messages of type ``sensor_msgs/PointCloud2``, MCAP files for
         ``foxglove.PointCloud`` (protobuf), too; without such, for packets of a Velodyne,
         ``velodyne_msgs/VelodyneScan``, or an Ouster, ``PacketMsg``. The first bytes of a file decide its format, not
-        its name.
+        its name. Or UDP ports of this computer, ``udp:2368``, ``udp:6699,7788`` or ``udp:ADDRESS:2368``, with the
+        address of this computer or of a group: what a sensor sends there now, without an end, as a ``.pcap`` of it.
+        Scans that are taken a second late or more are dropped.
     topic : str, optional
         What to read if there are several sensors: the topic of point clouds; ``TOPIC@FRAME`` for those of one frame;
         the serial number of an Ouster or in an ``.lvx2``; the IP address of another sensor, or ``ADDRESS:PORT``.
@@ -176,7 +179,7 @@ def is_capture(path: Path) -> bool:
     name if it cannot be read, which reading reports.
     """
     try:
-        return _kind(path) not in ("scan", "folder")
+        return is_port(path) or _kind(path) not in ("scan", "folder")
     except OSError:
         return path.suffix.lower() in CAPTURE_SUFFIXES
 
@@ -213,6 +216,11 @@ def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> Se
 
 def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     """Like `sensor_of`, with how it is known."""
+    if is_port(path):
+        try:
+            return _known_sensor(path, ".pcap", topic)
+        finally:
+            release(path)  # another process reads the scans
     kind = _readable_kind(path)
     if kind == "folder":
         sensors = {file: known_sensor(file, topic) for file in scan_files(path) if file.exists()}
@@ -223,8 +231,11 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
                 f"{path}: the captures in this folder are of several sensors ({', '.join(names)}); read them one by one"
             )
         return next(iter(sensors.values()), None)
-    if kind == "scan":
-        return None
+    return None if kind == "scan" else _known_sensor(path, kind, topic)
+
+
+def _known_sensor(path: Path, kind: str, topic: str | None) -> KnownSensor:
+    """That of one capture."""
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
@@ -273,6 +284,8 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _readable_kind(path: Path) -> str:
     """`_kind`, if `read_scans` reads it; PointsError otherwise."""
+    if is_port(path):
+        return ".pcap"
     with _reading(path):
         if not path.exists():
             expected = "a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"

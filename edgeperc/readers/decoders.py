@@ -44,6 +44,7 @@ from .packets import (
     velodyne_name,
     velodyne_packets,
 )
+from .ports import is_port, listen
 from .senders import Senders, layouts_beside
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
@@ -170,6 +171,8 @@ def _packet_scans(kind: str, job: _Job) -> Iterator[TimedScan]:
         yield from lvx2_scans(job.path, _choose("LiDAR", lvx2_sensors(job.path), job.topic), job.alive)
     else:
         yield from _pcap_scans(job)
+        while is_port(job.path):
+            yield from _pcap_scans(job)
 
 
 def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
@@ -178,6 +181,8 @@ def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
     Packets are counted to the end of the file before the first scan if a topic is given, or if there are a Velodyne's,
     whose library would mix sensors; otherwise behind the last scan.
     """
+    if is_port(job.path):
+        listen(job.path).first(job.alive)  # those who look at them wait without a sign of life
     is_velodyne = next(velodyne_packets(job.path), None) is not None
     is_whole = is_velodyne or job.topic is not None
     senders = Senders(job.path, job.alive, None if is_whole else SNIFFED_PACKETS)
@@ -185,6 +190,8 @@ def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
     for scan in _chosen_reader(job, senders, is_velodyne):
         n_scans += 1
         yield scan
+    if is_port(job.path):  # the next run of its packets may be another sensor's
+        return
     senders = senders if is_whole else Senders(job.path, job.alive)
     if senders.cut is not None:  # the decoders end there without a word
         raise senders.cut
@@ -242,7 +249,7 @@ def _velodyne_turns(job: _Job, sender: str | None) -> Iterator[TimedScan]:
     stream = VelodyneStream("device", "Reading a Velodyne capture")
     if velodyne_name(next(velodyne_packets(job.path, sender))) == "hdl-64e":
         stream.calibrate(packet for _, packet in velodyne_captured(job.path, job.alive, sender))
-    for stamp_s, packet in velodyne_captured(job.path, job.alive, sender):
+    for stamp_s, packet in velodyne_captured(job.path, job.alive, sender, endless=True):
         yield from stream.add(stamp_s, packet)
     yield from stream.end()
 
@@ -257,7 +264,7 @@ def _ouster_turns(job: _Job) -> Iterator[TimedScan]:
     sizes = {size for layout in layouts for size in (layout.packet_bytes, *layout.other_bytes)}
     ports, n_other_sizes, n_used, others = set[int](), Counter[int](), 0, Counter[tuple[int, int]]()
     senders = Counter[tuple[str, int]]()
-    datagrams = Datagrams(job.path, job.alive)
+    datagrams = Datagrams(job.path, job.alive, endless=True)
     for datagram in datagrams:
         size = len(datagram.payload)
         if size not in sizes:

@@ -16,6 +16,7 @@ from .livox_packets import LivoxStream, points_of
 from .mems_packets import MemsFormat, MemsStream, mems_format_of
 from .mirror_packets import MirrorStream, read_mirrors
 from .packets import Datagrams
+from .ports import named
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
     FORMATS,
@@ -54,13 +55,14 @@ def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tu
         whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"
         raise PointsError(
             f"the angles of the lasers of this {row.title} are not known. {there}Put {whose} beside it, as "
-            f"{path.stem}.csv"
+            f"{named(path).stem}.csv"
         )
     return row, said
 
 
 def _file_of(path: Path, suffix: str) -> Path | None:
     """Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture."""
+    path = named(path)
     files = sorted(path.absolute().parent.glob(f"*{suffix}"))
     own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
     return min(own, key=lambda each: len(each.stem), default=None)
@@ -77,9 +79,12 @@ def columns_of(row: Format, payloads: Iterable[memoryview]) -> int:
     return round(firings * 360.0 / float(np.median(steps))) if len(steps) else 0
 
 
-def payloads_of(path: Path, sender: str | None, alive: Callable[[], None]) -> Iterator[memoryview]:
+def payloads_of(
+    path: Path, sender: str | None, alive: Callable[[], None], *, endless: bool = False
+) -> Iterator[memoryview]:
     """What the packets of a sender carry, None: of all."""
-    return (datagram.payload for datagram in Datagrams(path, alive) if datagram.is_from(sender))
+    datagrams = Datagrams(path, alive, endless=endless)
+    return (datagram.payload for datagram in datagrams if datagram.is_from(sender))
 
 
 def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview]) -> Opened | None:
@@ -108,7 +113,7 @@ def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview
         if file is None:
             raise PointsError(
                 f"where the lasers of this {row.title} look is not known. Put the correction file of the unit beside "
-                f"it, as {path.stem}.dat"
+                f"it, as {named(path).stem}.dat"
             )
         return MirrorStream(row, read_mirrors(file)), partial(is_of, row)
     found, angles = open_spinning(path, row, units)
@@ -142,14 +147,13 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     first = sender or lidar.first
     if lidar.row is not None:
         stream, is_of_sensor = open_stream(path, lidar.row, payloads_of(path, sender, alive))
-        for payload in payloads_of(path, first, alive):
+        for payload in payloads_of(path, first, alive, endless=True):
             if is_of_sensor(payload):
                 yield from stream.add(payload)
         yield from stream.end()
     else:
         livox = LivoxStream()
-        for datagram in Datagrams(path, alive):
-            points = points_of(datagram.payload) if datagram.is_from(first) else None
-            if points is not None:
+        for payload in payloads_of(path, first, alive, endless=True):
+            if (points := points_of(payload)) is not None:
                 yield from livox.add(points)
         yield from livox.end()

@@ -6,6 +6,7 @@ each laser looks. Angles are in 1/256 of a hundredth of a degree.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -13,11 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import PointsError
-from ..types.points import Bytes, Floats, Ints64
+from ..types.points import Floats, Ints64
 from .spinning_packets import Format, time_of
 from .times import TimedScan
 
 _DEGREE = 25_600
+_TURN = 360 * _DEGREE
+_MOTOR = struct.Struct("<HB")  # hundredths of a degree, and 256ths of one
 _N_LASERS, _N_STEPS, _STEP = 128, 180, 2 * _DEGREE  # a correction every two degrees of the motor
 _MOST_MIRRORS = 8
 _MOST_PACKETS = 10_000  # of a frame, which has 600; 1,200 with two returns
@@ -29,16 +32,17 @@ class Mirrors(NamedTuple):
     and how far they are off at each step of the motor, (2, lasers, steps).
     """
 
-    begins: Ints64
-    ends: Ints64
+    begins: list[int]
+    ends: list[int]
     lasers: Ints64
     off: Ints64
 
-    def at(self, motor: Ints64) -> Ints64:
-        """Which mirror is in front of the lasers at these angles of the motor; -1: none."""
-        turn = 360 * _DEGREE
-        is_in = (motor[..., None] - self.begins) % turn <= (self.ends - self.begins) % turn
-        return np.where(is_in.any(-1) & (motor < turn), is_in.argmax(-1), -1)
+    def at(self, motor: int) -> int:
+        """Which mirror is in front of the lasers at this angle of the motor; -1: none."""
+        for mirror, (begin, end) in enumerate(zip(self.begins, self.ends, strict=True)):
+            if motor < _TURN and (motor - begin) % _TURN <= (end - begin) % _TURN:
+                return mirror
+        return -1
 
 
 def read_mirrors(path: Path) -> Mirrors:
@@ -60,7 +64,14 @@ def read_mirrors(path: Path) -> Mirrors:
     words, off = np.frombuffer(rest[: 8 * (n + _N_LASERS)], "<i4"), np.frombuffer(rest[8 * (n + _N_LASERS) :], np.int8)
     angles = resolution * words.astype(np.int64)
     steps = 256 * resolution * off.astype(np.int64).reshape(2, _N_LASERS, _N_STEPS)
-    return Mirrors(angles[:n], angles[n : 2 * n], angles[2 * n :].reshape(2, _N_LASERS), steps)
+    return Mirrors(angles[:n].tolist(), angles[n : 2 * n].tolist(), angles[2 * n :].reshape(2, _N_LASERS), steps)
+
+
+class _Packet(NamedTuple):
+    content: bytes
+    time_s: float
+    motor: list[int]  # its angles at the blocks
+    shown: list[bool]  # blocks of this frame
 
 
 class MirrorStream:
@@ -68,7 +79,7 @@ class MirrorStream:
 
     def __init__(self, row: Format, mirrors: Mirrors) -> None:
         self._row, self._mirrors = row, mirrors
-        self._packets, self._mirror, self._size = list[bytes](), -1, 0
+        self._packets, self._mirror, self._size = list[_Packet](), -1, 0
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
         """The frames that end in a packet of the format: where another mirror begins. All have the size of the first;
@@ -77,48 +88,42 @@ class MirrorStream:
         self._size = self._size or len(payload)
         if len(payload) != self._size:
             return
-        content = bytes(payload)
-        for mirror in dict.fromkeys(self._mirrors.at(self._motor([content]))[0].tolist()):
+        row, mirrors = self._row, self._mirrors
+        places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
+        motor = [256 * hundredths + fine for hundredths, fine in (_MOTOR.unpack_from(payload, at) for at in places)]
+        at = [mirrors.at(angle) for angle in motor]
+        for mirror in dict.fromkeys(at):
             if mirror < 0:
                 continue
             if mirror != self._mirror or len(self._packets) >= _MOST_PACKETS:
                 yield from self.end()
             self._mirror = mirror
-            self._packets.append(content)
+            self._packets.append(_Packet(bytes(payload), time_of(row, payload), motor, [each == mirror for each in at]))
 
     def end(self) -> Iterator[TimedScan]:
         """The last frame, which may be a part."""
         packets, self._packets = self._packets, []
         if not packets:
             return
-        motor = self._motor(packets)
-        is_second = (motor[:, 1] == motor[:, 0])[:, None]  # of two returns
-        returns = self._blocks(packets)[..., 3:].reshape(*motor.shape, _N_LASERS, 4)
+        row = self._row
+        content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
+        blocks = content[:, row.header : row.header + row.n_blocks * row.block_bytes].reshape(-1, row.block_bytes)
+        returns = blocks[:, row.first :].reshape(len(packets), row.n_blocks, _N_LASERS, row.channel_bytes)
         units = returns[..., 0].astype(np.int64) | returns[..., 1].astype(np.int64) << 8
+        motor = np.array([each.motor for each in packets])
+        is_second = (motor[:, 1] == motor[:, 0])[:, None]  # of two returns
         units[:, 1][is_second & (units[:, 1] == units[:, 0])] = 0
         late_us = np.where(is_second, [0.0, 0.0], [_BLOCK_US, 0.0]) + _LATE_US
-        times_s = np.array([time_of(self._row, memoryview(each)) for each in packets])[:, None] - 1e-6 * late_us
-        fired_s = times_s[..., None] + 1e-6 * np.array(self._row.fires_us)
-        shown = (units > 0) & (self._mirrors.at(motor) == self._mirror)[..., None]
+        times_s = np.array([each.time_s for each in packets])[:, None] - 1e-6 * late_us
+        fired_s = times_s[..., None] + 1e-6 * np.array(row.fires_us)
+        shown = (units > 0) & np.array([each.shown for each in packets])[..., None]
         p, b, laser = np.nonzero(shown)
         azimuth, elevation = self._directions(motor[p, b], laser)
-        ranges = 1e-3 * packets[0][self._row.mm_at] * units[shown]
+        ranges = 1e-3 * packets[0].content[row.mm_at] * units[shown]
         flat = ranges * np.cos(elevation)
         values = (flat * np.sin(azimuth), flat * np.cos(azimuth), ranges * np.sin(elevation), returns[..., 2][shown])
         scan = np.stack(values, axis=1).astype(np.float32)
         yield TimedScan(float(fired_s[shown].max() if len(p) else times_s[0, 1]), scan, fired_s[shown])
-
-    def _blocks(self, packets: list[bytes]) -> Bytes:
-        """(n, blocks, bytes)."""
-        row = self._row
-        content = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), -1)
-        body = content[:, row.header : row.header + row.n_blocks * row.block_bytes]
-        return body.reshape(len(packets), row.n_blocks, row.block_bytes)
-
-    def _motor(self, packets: list[bytes]) -> Ints64:
-        """(n, blocks) its angle."""
-        low, high, fine = np.moveaxis(self._blocks(packets)[..., :3].astype(np.int64), -1, 0)
-        return (high << 8 | low) * 256 + fine
 
     def _directions(self, motor: Ints64, laser: Ints64) -> Floats:
         """(2, n) azimuth and elevation [rad]; a mirror turns a ray by twice its own angle."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PointsError
+from .ports import named
 
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
@@ -25,6 +26,7 @@ def metadata_beside(path: Path) -> list[Path]:
     for sensor profiles, which `edgeperc info --write` may have put there.
     """
     alike: dict[int, list[Path]] = {}
+    path = named(path)
     for file in sorted(path.absolute().parent.iterdir()):
         n = len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
         if n and file.suffix.lower() == ".json" and file.is_file():

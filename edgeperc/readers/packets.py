@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .pcap import PCAP_MAGIC, CutShortError, pcap_packets
+from .ports import Datagram, is_port, listen
 
 LVX_MAGIC = b"livox_tech"
 """First bytes of Livox' own files."""
@@ -70,19 +71,6 @@ def capture_kind(head: bytes) -> str | None:
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
 
 
-class Datagram(NamedTuple):
-    """What a UDP datagram carries."""
-
-    sender: str  # the IPv4 or IPv6 address
-    port: int  # that it was sent to
-    stamp_s: float  # when its last part was captured
-    payload: memoryview
-
-    def is_from(self, sender: str | None) -> bool:
-        """Whether it is one of a sender's, as `sender_names` calls them; None: any."""
-        return sender in (None, self.sender, f"{self.sender}:{self.port}")
-
-
 class _EndsEarlyError(ValueError):
     """A packet was not captured to its end."""
 
@@ -96,21 +84,33 @@ class _Fragment(NamedTuple):
 
 
 class Datagrams:
-    """The whole UDP datagrams of a pcap file, put together from fragments, each once; other packets are left out.
+    """The whole UDP datagrams of a pcap file, put together from fragments, each once; other packets are left out. Of
+    ports, the first ones, or all until there is silence.
 
     most : packets of the file that are looked at; None: all.
+    endless : of ports, not the first ones alone.
     n_bad : so far, those that are empty, incomplete, or contradict themselves.
     n_cut : packets of them that end early.
     n_packets, cut : of the file so far, and what is wrong where it ends early.
     """
 
-    def __init__(self, path: Path, alive: Callable[[], None], most: int | None = None) -> None:
-        self._path, self._alive, self._most = path, alive, most
+    def __init__(
+        self, path: Path, alive: Callable[[], None], most: int | None = None, *, endless: bool = False
+    ) -> None:
+        self._path, self._alive, self._most, self._endless = path, alive, most, endless
         self.n_bad = self.n_cut = self.n_packets = 0
         self.cut: CutShortError | None = None
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
+        if is_port(self._path):
+            listener = listen(self._path)
+            for datagram in listener.run(self._alive) if self._endless else listener.first(self._alive):
+                if self.n_packets % 10_000 == 0:
+                    self._alive()
+                self.n_packets += 1
+                yield datagram
+            return
         before: tuple[memoryview, ...] = ()
         try:
             for link, stamp_s, packet in islice(pcap_packets(self._path), self._most):
@@ -177,10 +177,13 @@ def velodyne_packets(path: Path, sender: str | None = None) -> Iterator[memoryvi
     yield from (packet for _, packet in _bare_velodyne_packets(path, SNIFFED_PACKETS))
 
 
-def velodyne_captured(path: Path, alive: Callable[[], None], sender: str | None) -> Iterator[tuple[float, memoryview]]:
+def velodyne_captured(
+    path: Path, alive: Callable[[], None], sender: str | None, *, endless: bool = False
+) -> Iterator[tuple[float, memoryview]]:
     """When each packet of a Velodyne, of a sender or all, was captured, and the packet, in the order of its clock."""
     are_sent = False
-    for datagram in in_order(each for each in Datagrams(path, alive) if each.is_from(sender)):
+    datagrams = Datagrams(path, alive, endless=endless)
+    for datagram in in_order(each for each in datagrams if each.is_from(sender)):
         if len(datagram.payload) == VELODYNE_BYTES:
             are_sent = True
             yield datagram.stamp_s, datagram.payload
@@ -230,7 +233,8 @@ def is_of_velodyne(datagram: Datagram) -> bool:
 
 def _bare_velodyne_packets(path: Path, most: int | None = None) -> Iterator[tuple[float, memoryview]]:
     """When those among the first, or all, were captured whose sender is not known, and the packets."""
-    for link, stamp_s, packet in islice(pcap_packets(path, whole=False), most):
+    captured = () if is_port(path) else pcap_packets(path, whole=False)
+    for link, stamp_s, packet in islice(captured, most):
         if len(packet) > VELODYNE_BYTES and bytes(packet[-VELODYNE_BYTES : 2 - VELODYNE_BYTES]) == _FLAG:
             try:
                 at = _ip_at(packet, link)

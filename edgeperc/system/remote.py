@@ -19,10 +19,10 @@ MOST_BYTES = 4 * 2**30
 
 
 def location(text: str) -> Path | Remote:
-    """A path of this computer, also from ``file://``, or a URL."""
+    """A path of this computer, also from ``file://``, ports of it (``udp:2368``), or a URL."""
     if text.startswith("file://"):
         return Path(unquote(urlsplit(text).path))
-    return Remote(text.rstrip("/")) if "://" in text else Path(text)
+    return Remote(text.rstrip("/")) if "://" in text and not text.startswith("udp:") else Path(text)
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class Packets:
         words = case.rng.integers(-(2**31), 2**31, (2, 128 + 2))
         begins, ends = case.pick([words[:, :2], np.array([[0, 5 * 10**6], [5 * 10**6, 9 * 10**6]])])
         off = 255 * 256 * case.rng.integers(-128, 128, (2, 128, 180))
-        stream = MirrorStream(FORMATS["at128"], Mirrors(begins, ends, words[:, 2:], off))
+        stream = MirrorStream(FORMATS["at128"], Mirrors(begins.tolist(), ends.tolist(), words[:, 2:], off))
         table = [memoryview(each.tobytes()) for each in damaged(self.mirrors, case.rng)[:THROUGH_STREAM]]
         scans = [scan for each in table if format_of(each) is FORMATS["at128"] for scan in stream.add(each)]
         check_scans([*scans, *stream.end()])

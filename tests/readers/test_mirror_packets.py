@@ -120,7 +120,7 @@ def test_a_resolution_scales_the_angles(tmp_path: Path) -> None:
         read.append(read_mirrors(path))
     np.testing.assert_array_equal(read[0].begins, read[1].begins)
     for one, three in ((read[0].lasers, read[1].lasers), (read[0].off, read[1].off), (read[0].ends, read[1].ends)):
-        np.testing.assert_array_equal(3 * one, three)
+        np.testing.assert_array_equal(3 * np.array(one), three)
 
 
 WHOLE = at128_correction(BEGINS, ENDS, *unit())

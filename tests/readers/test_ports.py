@@ -1,0 +1,176 @@
+"""Packets that come at ports of this computer are read as a capture of them is."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture_writers import write_pcap
+from lidar_writers import MODELS, blocks_of, calibration, packets_of, ranges, unit_angles
+
+from cli_helpers import Shell
+from edgeperc import PointsError, read_timed_scans, sensor_of, stream
+from edgeperc.readers import ports
+from edgeperc.readers.packets import Datagrams
+from edgeperc.system.remote import location
+
+Sender = Callable[[Sequence[bytes]], None]
+MODEL = MODELS["pandar40p"]
+PER_TURN = 1800
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.fixture
+def send(port: int) -> Iterator[Sender]:
+    """Sends packets again and again, 2,000 a second."""
+    over, threads = threading.Event(), list[threading.Thread]()
+
+    def run(packets: Sequence[bytes]) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            while not over.is_set():
+                for packet in packets:
+                    one.sendto(packet, ("127.0.0.1", port))
+                    over.wait(0.0005)
+
+    def begin(packets: Sequence[bytes]) -> None:
+        threads.append(threading.Thread(target=run, args=(packets,)))
+        threads[-1].start()
+
+    yield begin
+    over.set()
+    for thread in threads:
+        thread.join()
+
+
+@pytest.fixture
+def source(port: int) -> Iterator[Path]:
+    """The ports, which this process listens to no more after the test."""
+    yield (path := Path(f"udp:{port}"))
+    ports.release(path)
+
+
+def packets() -> list[bytes]:
+    """Two turns."""
+    return packets_of(MODEL, blocks_of(MODEL, *ranges(MODEL, 2 * PER_TURN)))
+
+
+def silent() -> None:
+    """No sign of life is wanted."""
+
+
+def test_turns_at_a_port_are_those_of_a_capture(
+    tmp_path: Path, port: int, send: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoded in a process of their own; the calibration has the number of the port."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("drive", port):
+        Path(f"{name}.csv").write_text(calibration(unit_angles(MODEL)))
+    sent = packets()
+    of_capture = [*read_timed_scans(write_pcap(tmp_path / "drive.pcap", sent))]
+    send(sent)
+    sensor = sensor_of(f"udp:{port}")
+    assert sensor is not None
+    assert sensor == sensor_of(tmp_path / "drive.pcap")
+    whole = list[np.ndarray]()
+    with closing(read_timed_scans(f"udp://127.0.0.1:{port}")) as scans:  # type: ignore[type-var]
+        for scan in scans:
+            whole += [scan.points] * any(np.array_equal(scan.points, each.points) for each in of_capture)
+            if len(whole) == 4:
+                break
+    assert not np.array_equal(whole[0], whole[1])
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_stream_takes_ports(port: int, source: Path, send: Sender) -> None:
+    """As they come, whatever the times in the packets."""
+    send(packets_of(MODELS["pandarxt-16"], blocks_of(MODELS["pandarxt-16"], *ranges(MODELS["pandarxt-16"], 2000))))
+    with stream(str(source), lambda points, stamp_s: points) as live:  # type: ignore[arg-type, return-value]
+        answers = [live.take(30.0) for _ in range(3)]
+    assert all(answer is not None and len(answer.perception) > 100 for answer in answers)  # type: ignore[arg-type]
+
+
+def test_a_run_of_packets_ends_with_silence_or_where_they_are_taken_too_late(
+    source: Path, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the next one begins with what comes then."""
+    monkeypatch.setattr(ports, "SILENCE_S", 0.3)
+    monkeypatch.setattr(ports, "FIRST_S", 0.1)
+    signs, read = list[int](), list[bytes]()
+    ports.listen(source)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.sendto(b"first", ("127.0.0.1", port))
+        assert [bytes(each.payload) for each in Datagrams(source, silent)] == [b"first"]
+        assert [bytes(each.payload) for each in Datagrams(source, silent)] == [b"first"]  # as often as is wanted
+        for each in Datagrams(source, lambda: signs.append(1), endless=True):
+            read.append(bytes(each.payload))
+            if len(read) < 4:
+                one.sendto(b"%d" % len(read), ("127.0.0.1", port))
+        assert read == [b"first", b"1", b"2", b"3"]
+        assert signs
+        one.sendto(b"another run", ("127.0.0.1", port))
+        assert [(each.sender, each.port, bytes(each.payload)) for each in Datagrams(source, silent)] == [
+            ("127.0.0.1", port, b"another run")
+        ]
+        monkeypatch.setattr(ports, "LATE_S", 0.05)
+        datagrams = iter(Datagrams(source, silent, endless=True))
+        assert bytes(next(datagrams).payload) == b"another run"
+        for content in (b"late", b"new"):
+            one.sendto(content, ("127.0.0.1", port))
+            time.sleep(0.3)
+        assert [*datagrams] == []
+        assert [bytes(each.payload) for each in Datagrams(source, silent)] == [b"new"]
+
+
+def test_a_port_that_is_taken_is_said(source: Path, port: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", port))
+        with pytest.raises(PointsError, match=rf"^udp:{port}: port {port} cannot be listened to \(.*\); another"):
+            sensor_of(source)
+
+
+@pytest.mark.parametrize(
+    "name", ["udp:", "udp:lidar", "udp:0", "udp:70000", "udp:1.2.3:2368", "udp:2368,", "udp:2368/a"]
+)
+def test_other_names_are_refused(name: str) -> None:
+    with pytest.raises(PointsError, match=r"udp:.*: expected ports as udp:2368, udp:6699,7788 or udp:ADDRESS:2368"):
+        sensor_of(name)
+
+
+def test_a_port_at_which_nothing_comes_is_said(source: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
+    monkeypatch.setattr(ports, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(ports, "SILENCE_S", 0.1)
+    with pytest.raises(PointsError, match=r"^udp:\d+: no packet came in 0.1 s. Let the sensor send to"):
+        sensor_of(source)
+
+
+@pytest.mark.parametrize(
+    ("text", "file"),
+    [("udp:2368", "2368"), ("udp://:2368", "2368"), ("udp:6699,7788", "6699"), ("udp:239.0.0.5:7502", "7502")],
+)
+def test_files_of_a_unit_have_the_number_of_the_first_port(text: str, file: str) -> None:
+    path: Any = location(text)
+    assert ports.is_port(path)
+    assert ports.named(path) == Path(file)
+    assert ports.named(Path("a/drive.pcap")) == Path("a/drive.pcap")
+
+
+def test_a_group_is_joined(port: int) -> None:
+    path = Path(f"udp:239.255.0.7:{port}")
+    try:
+        ports.listen(path)
+    except PointsError:
+        pytest.skip("this computer has no network with multicast")
+    ports.release(path)
