@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from itertools import islice
 from pathlib import Path
 
 from ..errors import PointsError, SensorError
@@ -10,6 +11,8 @@ from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_ego_box, add_sensor, options
 from .output import print_rows
 from .scans import check_profile_place, find_scans, with_mounting
+
+_MOST_OF_PORTS = 50  # scans of a sensor that goes on sending
 
 
 def add_parser(commands: Commands) -> None:
@@ -43,6 +46,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
     """Fit a remission function and write the sensor profile."""
     from ..preprocess.sensor_fit import fit_sensor
     from ..readers.captures import read_scans
+    from ..readers.ports import is_port
     from ..types.sensor import get_sensor
 
     files = find_scans(arguments.scans)
@@ -53,7 +57,11 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
         )
     check_profile_place(arguments.out)
-    scans = [points for path in files.paths for _, points in read_scans(path)]
+    scans = [
+        points
+        for path in files.paths
+        for _, points in islice(read_scans(path), _MOST_OF_PORTS if is_port(path) else None)
+    ]
     profile, functions = fit_sensor(scans, get_sensor(with_mounting(arguments.sensor, arguments)), arguments.to)
     assert profile.remission is not None
     arguments.out.parent.mkdir(parents=True, exist_ok=True)

@@ -180,8 +180,11 @@ def _suggest_ego_box(
 
 def _is_model(thing: str) -> bool:
     """A path that exists, or looks like one, is a scan unless it ends in .onnx; anything else is a model's name."""
+    from ..readers.ports import is_port
+
     path = Path(thing)
-    return path.suffix == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
+    is_scan = path.exists() or path.suffix or len(path.parts) > 1 or is_port(path)
+    return path.suffix == ".onnx" or not is_scan
 
 
 def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tuple[str, str]]:

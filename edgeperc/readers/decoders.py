@@ -181,16 +181,18 @@ def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
     Packets are counted to the end of the file before the first scan if a topic is given, or if there are a Velodyne's,
     whose library would mix sensors; otherwise behind the last scan.
     """
-    if is_port(job.path):
-        listen(job.path).first(job.alive)  # those who look at them wait without a sign of life
+    listener = listen(job.path) if is_port(job.path) else None
+    if listener is not None:
+        listener.first(job.alive)  # those who look at them wait without a sign of life
     is_velodyne = next(velodyne_packets(job.path), None) is not None
     is_whole = is_velodyne or job.topic is not None
     senders = Senders(job.path, job.alive, None if is_whole else SNIFFED_PACKETS)
     n_scans = 0
     for scan in _chosen_reader(job, senders, is_velodyne):
         n_scans += 1
-        yield scan
-    if is_port(job.path):  # the next run of its packets may be another sensor's
+        if listener is None or (n_scans > 1 and listener.is_running):  # others are parts of a turn
+            yield scan
+    if listener is not None:  # the next run of its packets may be another sensor's
         return
     senders = senders if is_whole else Senders(job.path, job.alive)
     if senders.cut is not None:  # the decoders end there without a word

@@ -102,6 +102,7 @@ class Listener:
         while not self._first:
             if self._closed.is_set():
                 raise PointsError("the ports were closed")
+            self._is_late = False
             alive()
             datagram = self._next(SILENCE_S)
             if datagram is not None:
@@ -117,20 +118,23 @@ class Listener:
                 )
         return self._first
 
+    @property
+    def is_running(self) -> bool:
+        """Whether packets of this run may come."""
+        return bool(self._first)
+
     def run(self, alive: Callable[[], None]) -> Iterator[Datagram]:
         """All packets of this run; the next call has those of the next one."""
         yield from self.first(alive)
         while (datagram := self._next(SILENCE_S)) is not None:
             yield datagram
-        self._first = []
+        self._first, self._is_late = [], False
 
     def _next(self, wait_s: float) -> Datagram | None:
-        """The next packet; None if none comes in time, or if some were dropped."""
+        """The next packet; None if none comes in time, or if some were dropped in this run."""
         with self._changed:
-            if not self._changed.wait_for(lambda: self._waiting, max(wait_s, 0.0)) or self._is_late:
-                self._is_late = False
-                return None
-            return self._waiting.popleft()
+            is_there = self._changed.wait_for(lambda: self._waiting, max(wait_s, 0.0))
+            return self._waiting.popleft() if is_there and not self._is_late else None
 
     def _receive(self, port: int, of_port: socket.socket) -> None:
         while not self._closed.is_set():

@@ -130,6 +130,7 @@ def test_a_run_of_packets_ends_with_silence_or_where_they_are_taken_too_late(
         for content in (b"late", b"new"):
             one.sendto(content, ("127.0.0.1", port))
             time.sleep(0.3)
+        assert [bytes(each.payload) for each in Datagrams(source, silent)] == [b"another run"]
         assert [*datagrams] == []
         assert [bytes(each.payload) for each in Datagrams(source, silent)] == [b"new"]
 
