@@ -24,8 +24,8 @@ def knows_road(labels: PointLabels | None) -> bool:
     return labels is not None and not set(ROADS).isdisjoint(labels.classes)
 
 
-def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> Mask:
-    """Whether the return of the ground nearest to each cell, along its azimuth, is of the road."""
+def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> tuple[Mask, Mask]:
+    """Cells whose nearest return of the ground, along their azimuth, is of the road; those that have one in view."""
     of_class = [1 if name in ROADS else -1 if name in OTHER_GROUND else 0 for name in labels.classes]
     side = np.array(of_class)[labels.labels]
     known = np.flatnonzero((side != 0) & labels.in_view & (np.abs(height_m) <= ON_GROUND_M))
@@ -46,4 +46,5 @@ def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view
     nearest = np.where(ring - inner <= outer - ring, inner, outer)
     exists = (nearest >= 0) & (nearest < n_rings)
     is_road = exists & (np.take_along_axis(votes, np.where(exists, nearest, 0), axis=1) > 0)
-    return np.asarray(is_road.reshape(-1)[bins(x, y)], np.bool_)
+    at = bins(x, y)
+    return is_road.reshape(-1)[at], exists.reshape(-1)[at]

@@ -52,6 +52,8 @@ class OccupancyGrid:
         Height of the highest return or box of an obstacle above the ground [m]; NaN in other cells.
     observed : (rows, columns) bool
         Cells that the scan observed (`edgeperc.ground.observed.Observer`).
+    judged : (rows, columns) bool
+        Cells that the top view sees, or in whose direction points in view tell the road.
     cell_m : float
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float
@@ -67,6 +69,7 @@ class OccupancyGrid:
     obstacle: Mask
     height_m: Heights
     observed: Mask
+    judged: Mask
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
@@ -281,15 +284,16 @@ def occupancy_grid(
     for box in frame.move_boxes(perception.boxes):
         np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=footprints([box], view))
     obstacle = ~np.isnan(tallest)
-    drivable, seen = _drivable(top_view, view)
+    drivable, judged = _drivable(top_view, view)
     if perception.points is not None and knows_road(perception.points):
-        around = nearest_is_road(moved, perception.points, ground.height_m, view)
-        drivable = np.where(seen, drivable, around)
+        around, told = nearest_is_road(moved, perception.points, ground.height_m, view)
+        drivable, judged = np.where(judged, drivable, around), judged | told
     return OccupancyGrid(
         drivable=drivable & observed & ~obstacle,  # cells of the top view may be smaller, and observed in part of these
         obstacle=obstacle,
         height_m=tallest,
         observed=observed,
+        judged=judged,
         cell_m=view.cell_m,
         x_range_m=(view.corner_m[0], view.x_range_m[1]),
         y_range_m=(view.corner_m[1], view.y_range_m[1]),

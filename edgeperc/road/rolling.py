@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError, OptionError, StampError, TrackingError
-from ..system.clock import LATEST_S, Clock
+from ..system.clock import GAP_S, LATEST_S, Clock
 from ..system.fields import OPTIONS
 from ..tracking import Track
 from ..tracking.moving import MOVABLE, as_classes, movable_points
@@ -24,7 +24,6 @@ from ..types.points import Bytes, Floats, Mask
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
-from .around import knows_road
 from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, grid_message, occupancy_grid
 
 # What a cell holds.
@@ -98,7 +97,7 @@ class RollingGrid:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._clock, self._z_m = Clock(), 0.0
+        self._clock, self._z_m = Clock(gap_s=max(GAP_S, self._remember_s)), 0.0
         self._corner = (0, 0)  # cells from the odometry's origin to the window's corner with the lowest x and y
         self._forget(np.ones(self._kind.shape, np.bool_))
 
@@ -166,7 +165,7 @@ class RollingGrid:
             min_height_m=self._min_height_m,
             sensor=sensor,
         )
-        kinds, movable = self._kinds_of(grid, perception), self._movable(perception, points, tracks)
+        kinds, movable = _kinds_of(grid), self._movable(perception, points, tracks)
         if step != "next":
             self.reset()
         self._clock, self._z_m = clock, z_m
@@ -174,17 +173,6 @@ class RollingGrid:
         self._roll(*(math.floor(along / self._cell_m) - n // 2 for along in pose[:2, 3]))
         self._forget(self._fleeting | (self._seen_s < stamp_s - self._remember_s))
         self._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
-
-    def _kinds_of(self, grid: OccupancyGrid, perception: Perception) -> Bytes:
-        """What the scan shows of its own cells."""
-        judged = np.full(grid.observed.shape, knows_road(perception.points))
-        if perception.top_view is not None:
-            judged |= perception.top_view.geometry.cells(*self._view.cell_centers())[2]
-        kinds = np.where(judged, _OFF_ROAD, _GROUND).astype(np.uint8)
-        kinds[grid.drivable] = _ROAD
-        kinds[grid.obstacle] = _OBSTACLE
-        kinds[grid.unknown] = _NOTHING
-        return kinds
 
     def _movable(self, perception: Perception, points: ArrayLike, tracks: Iterable[Track]) -> Mask:
         """The scan's own cells in which something is that could move."""
@@ -299,6 +287,15 @@ class RollingGrid:
         """
         corner_m = (*self.origin_m, self._z_m)
         return grid_message(self.values(off_road, unjudged), self._cell_m, self.stamp_s, frame_id, corner_m)
+
+
+def _kinds_of(grid: OccupancyGrid) -> Bytes:
+    """What a scan shows of its own cells."""
+    kinds = np.where(grid.judged, _OFF_ROAD, _GROUND).astype(np.uint8)
+    kinds[grid.drivable] = _ROAD
+    kinds[grid.obstacle] = _OBSTACLE
+    kinds[grid.unknown] = _NOTHING
+    return kinds
 
 
 def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:

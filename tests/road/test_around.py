@@ -16,7 +16,7 @@ VIEW = TopViewGeometry((-12.0, 12.0), (-8.0, 8.0), cell_m=0.8)
 
 
 def slow(points: NDArray[np.float32], labels: PointLabels, height_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The same, cell by cell."""
+    """The same, cell by cell, (2, rows, columns)."""
     votes: dict[tuple[int, int], int] = {}
     for (x, y), label, seen, height in zip(
         points[:, :2].tolist(), labels.labels, labels.in_view, height_m, strict=True
@@ -26,12 +26,12 @@ def slow(points: NDArray[np.float32], labels: PointLabels, height_m: NDArray[np.
             place = place_of(x, y)
             votes[place] = votes.get(place, 0) + (1 if name == "road" else -1)
     xs, ys = VIEW.cell_centers()
-    found = np.zeros((VIEW.height, VIEW.width), np.bool_)
+    found = np.zeros((2, VIEW.height, VIEW.width), np.bool_)
     for r, x in enumerate(xs.ravel().tolist()):
         for c, y in enumerate(ys.ravel().tolist()):
             sector, ring = place_of(x, y)
             rings = sorted((abs(other - ring), other) for s, other in votes if s == sector)
-            found[r, c] = bool(rings) and votes[sector, rings[0][1]] > 0
+            found[:, r, c] = bool(rings) and votes[sector, rings[0][1]] > 0, bool(rings)
     return found
 
 
@@ -64,7 +64,7 @@ def test_the_curb_ends_the_road() -> None:
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros((x.size, 2))]).astype(np.float32)
     names = np.where(np.abs(y.ravel()) < 4.0, CLASSES.index("road"), CLASSES.index("sidewalk")).astype(np.uint8)
     labels = PointLabels(names, np.ones(x.size, np.bool_), CLASSES)
-    found = nearest_is_road(points, labels, np.zeros(x.size, np.float32), VIEW)
+    found, _ = nearest_is_road(points, labels, np.zeros(x.size, np.float32), VIEW)
     beside = np.abs(np.broadcast_to(VIEW.cell_centers()[1], found.shape))
     assert found[beside < 3.5].all()
     assert not found[(beside > 4.5) & (beside < 7.0)].any()
@@ -73,8 +73,8 @@ def test_the_curb_ends_the_road() -> None:
 def test_labels_above_the_ground_and_out_of_view_do_not_count() -> None:
     points = np.array([[5.2, 0.4, 0.0, 0.0], [6.0, 0.4, 0.0, 0.0]], np.float32)
     labels = PointLabels(np.full(2, CLASSES.index("road"), np.uint8), np.array([True, False]), CLASSES)
-    assert nearest_is_road(points, labels, np.zeros(2, np.float32), VIEW).any()
-    assert not nearest_is_road(points, labels, np.array([1.0, 0.0], np.float32), VIEW).any()
+    assert np.any(nearest_is_road(points, labels, np.zeros(2, np.float32), VIEW)[0])
+    assert not np.any(nearest_is_road(points, labels, np.array([1.0, 0.0], np.float32), VIEW))
 
 
 def test_only_labels_with_a_road_know_it() -> None:

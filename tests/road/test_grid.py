@@ -204,7 +204,7 @@ def test_the_message_lies_in_the_frame_of_the_scan(mounting: Mounting) -> None:
     place = frame.R.T @ (post - frame.t)
     empty = np.zeros((60, 40), np.bool_)
     height_m = np.zeros((60, 40), np.float32)
-    grid = OccupancyGrid(empty, empty, height_m, ~empty, 0.5, (0.0, 30.0), (-10.0, 10.0), mounting=mounting)
+    grid = OccupancyGrid(empty, empty, height_m, ~empty, ~empty, 0.5, (0.0, 30.0), (-10.0, 10.0), mounting=mounting)
     origin = grid.to_occupancy_grid("lidar")["info"]["origin"]
     R = rotation_of(**origin["orientation"])
     corner = np.array([origin["position"][axis] for axis in "xyz"])

@@ -192,15 +192,19 @@ def test_the_window_moves_over_what_it_remembers(dx: int, dy: int) -> None:
     np.testing.assert_array_equal(grid.values()[kept], before[kept])
 
 
-def test_ground_off_the_road_stays_off_the_road_behind_the_vehicle() -> None:
-    """Road ahead right of y = 2 m; later, both lie beside the top view and are observed all the same."""
+@pytest.mark.parametrize("by_points", [False, True])
+def test_ground_off_the_road_stays_off_the_road_behind_the_vehicle(by_points: bool) -> None:
+    """Road ahead right of y = 2 m; later, both lie beside the view and are observed all the same."""
     cells = np.ones((40, 40), np.uint8)
     cells[:, :16] = 0
     view = TopView(cells, ("background", "drivable"), 0.5, (2.0, 22.0), (-10.0, 10.0), cells >= 0)
     grid = rolling()
     for k, at in enumerate((pose(), pose(8.0), pose(8.0, 0.0, 180.0))):
         points = scan(at)
-        grid.update(perceived(points, 1.0 + k, top_view=view if k < 2 else None), points, at)
+        in_view, names = (points[:, 0] > 2.0) & (k < 2), (1 + (points[:, 1] > 2.0)).astype(np.uint8)
+        labels = PointLabels(names, in_view, ("background", "road", "sidewalk"))
+        part: dict[str, Any] = {"points": labels} if by_points else {"top_view": view if k < 2 else None}
+        grid.update(replace(perceived(points, 1.0 + k), **part), points, at)
         assert (value(grid, 4.0, -4.0), value(grid, 4.0, 4.0)) == (0, 100)
         assert (value(grid, 4.0, 4.0, off_road=50), value(grid, 4.0, 4.0, off_road=-1)) == (50, -1)
     assert value(grid, -2.0, 4.0) == 0
@@ -218,6 +222,10 @@ def test_late_scans_and_clocks_that_jump() -> None:
     grid.update(perceived(nothing, 20.0), nothing, at)
     assert (value(grid, 6.0, 2.0), grid.stamp_s) == (-1, 20.0)
     grid.update(perceived(posted, 20.1), posted, at)
+    patient = rolling(remember_s=100.0)
+    for stamp_s, points in ((0.0, posted), (90.0, nothing)):
+        patient.update(perceived(points, stamp_s), points, at)
+        assert value(patient, 6.0, 2.0) == 100
     grid.reset()
     assert grid.stamp_s is None
     assert (grid.values() == -1).all()
