@@ -96,10 +96,12 @@ def listed(network: str = "") -> tuple[Variant, ...]:
     Raises
     ------
     CardError, ModelFileError
-        A model file is damaged.
+        A model file is damaged, or the package lies in an archive.
     """
-    names = (str(entry) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx"))
-    paths = [path for path in map(Path, names) if path.name.startswith(network)]
+    folder = resources.files(__name__)
+    if not isinstance(folder, Path):
+        raise ModelFileError(f"{folder} lies in an archive, in which no model can be opened; unpack it into a folder")
+    paths = [path for path in folder.iterdir() if path.suffix == ".onnx" and path.name.startswith(network)]
     variants = (Variant(path, _card(path, path.stat().st_mtime_ns)) for path in paths)
     return tuple(sorted(variants, key=lambda variant: (variant.name, variant.precision)))
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
 import zlib
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -73,6 +75,14 @@ def test_the_wheels_models_are_small() -> None:
 def test_a_name_that_no_model_has_is_refused(model: str, message: str) -> None:
     with pytest.raises(ModelFileError, match=message):
         resolve(model)
+
+
+def test_models_in_an_archive_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(tmp_path / "site.zip", "w") as archive:
+        archive.writestr("pointseg.onnx", b"")
+    monkeypatch.setattr(resources, "files", lambda _: zipfile.Path(tmp_path / "site.zip"))
+    with pytest.raises(ModelFileError, match=r"site\.zip/ lies in an archive.*; unpack it"):
+        resolve("pointseg")
 
 
 def test_research_models_lie_where_the_message_says() -> None:
