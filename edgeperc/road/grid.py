@@ -99,11 +99,9 @@ class OccupancyGrid:
         OptionError
             ``off_road`` is out of its range.
         """
-        found = np.full(self.drivable.shape, OPTIONS.whole("off_road", off_road, UNKNOWN, OCCUPIED), np.int8)
-        found[self.drivable] = FREE
-        found[self.obstacle] = OCCUPIED
-        found[self.unknown] = UNKNOWN
-        return np.ascontiguousarray(found[::-1, ::-1].T)
+        off_road = OPTIONS.whole("off_road", off_road, UNKNOWN, OCCUPIED)
+        found = np.select([self.unknown, self.obstacle, self.drivable], (UNKNOWN, OCCUPIED, FREE), off_road)
+        return np.ascontiguousarray(found[::-1, ::-1].T, np.int8)
 
     def to_occupancy_grid(self, frame_id: str = "base_link", off_road: int = OCCUPIED) -> dict[str, Any]:
         """Convert to the fields of a ROS message nav_msgs/OccupancyGrid.
@@ -263,8 +261,7 @@ def occupancy_grid(
     check_height(min_height_m)
     top_view = perception.top_view
     usual = TopViewGeometry() if top_view is None else top_view.geometry
-    if knows_road(perception.points):
-        usual = ALL_AROUND
+    usual = ALL_AROUND if knows_road(perception.points) else usual
     try:
         view = TopViewGeometry(x_range_m or usual.x_range_m, y_range_m or usual.y_range_m, cell_m=cell_m)
     except (CardError, TypeError, ValueError) as exc:

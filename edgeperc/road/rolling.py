@@ -24,7 +24,7 @@ from ..types.points import Bytes, Floats, Mask
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
-from .grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, check_height, grid_message, occupancy_grid
+from .grid import FREE, OCCUPIED, UNKNOWN, check_height, grid_message, occupancy_grid
 
 # What a cell holds.
 _NOTHING, _ROAD, _OFF_ROAD, _OBSTACLE, _GROUND = range(5)
@@ -165,7 +165,9 @@ class RollingGrid:
             min_height_m=self._min_height_m,
             sensor=sensor,
         )
-        kinds, movable = _kinds_of(grid), self._movable(perception, points, tracks)
+        masks = [grid.unknown, grid.obstacle, grid.drivable, grid.judged]
+        kinds = np.select(masks, (_NOTHING, _OBSTACLE, _ROAD, _OFF_ROAD), _GROUND).astype(np.uint8)
+        movable = self._movable(perception, points, tracks)
         if step != "next":
             self.reset()
         self._clock, self._z_m = clock, z_m
@@ -287,15 +289,6 @@ class RollingGrid:
         """
         corner_m = (*self.origin_m, self._z_m)
         return grid_message(self.values(off_road, unjudged), self._cell_m, self.stamp_s, frame_id, corner_m)
-
-
-def _kinds_of(grid: OccupancyGrid) -> Bytes:
-    """What a scan shows of its own cells."""
-    kinds = np.where(grid.judged, _OFF_ROAD, _GROUND).astype(np.uint8)
-    kinds[grid.drivable] = _ROAD
-    kinds[grid.obstacle] = _OBSTACLE
-    kinds[grid.unknown] = _NOTHING
-    return kinds
 
 
 def _road_in(pose: Floats, perception: Perception) -> tuple[Floats, float]:

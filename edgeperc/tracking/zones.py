@@ -171,7 +171,7 @@ class Line:
         Parameters
         ----------
         tracks : Tracks
-            Of the next scan.
+            Of the next scan. OptionError for anything else, such as a list of some of them: it has no time.
 
         Returns
         -------
@@ -179,6 +179,8 @@ class Line:
             Those that were counted now. A track counts if its way between two places beyond the margin crosses the line
             between its ends. A late scan (`Tracks.is_late`) counts nothing.
         """
+        if not isinstance(tracks, Tracks):
+            raise OptionError(f"got a {type(tracks).__name__}; expected the Tracks of a scan, with its time")
         if tracks.is_late:
             return ()
         self._now_s += elapsed_s(self._stamp_s, tracks.stamp_s)
@@ -198,9 +200,8 @@ class Line:
                 found.append(Crossing(track.id, track.label, side > 0.0, tracks.stamp_s))
             self.known[track.id] = place, counted, self._now_s
         self.known = {k: known for k, known in self.known.items() if self._now_s - known[2] <= FORGET_S}
-        n_left = sum(crossing.to_left for crossing in found)
-        self.to_left += n_left
-        self.to_right += len(found) - n_left
+        self.to_left += sum(crossing.to_left for crossing in found)
+        self.to_right += sum(not crossing.to_left for crossing in found)
         return tuple(found)
 
     def _left_of(self, place: Floats) -> float:

@@ -165,3 +165,5 @@ def test_errors_name_the_reason() -> None:
     for margin_m in (-1.0, math.nan, "a"):
         with pytest.raises(OptionError, match="margin_m"):
             Line((0, 0), (1, 0), margin_m=margin_m)
+    with pytest.raises(OptionError, match="got a list; expected the Tracks of a scan"):
+        Line((0, 0), (1, 0)).count([])  # type: ignore[arg-type]
