@@ -25,7 +25,7 @@ def knows_road(labels: PointLabels | None) -> bool:
 
 
 def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view: TopViewGeometry) -> tuple[Mask, Mask]:
-    """Cells whose nearest return of the ground, along their azimuth, is of the road; those that have one in view."""
+    """Cells whose nearest return of the ground, along their azimuth, is of the road; azimuths with points in view."""
     of_class = [1 if name in ROADS else -1 if name in OTHER_GROUND else 0 for name in labels.classes]
     side = np.array(of_class)[labels.labels]
     known = np.flatnonzero((side != 0) & labels.in_view & (np.abs(height_m) <= ON_GROUND_M))
@@ -46,5 +46,6 @@ def nearest_is_road(points: Points, labels: PointLabels, height_m: Heights, view
     nearest = np.where(ring - inner <= outer - ring, inner, outer)
     exists = (nearest >= 0) & (nearest < n_rings)
     is_road = exists & (np.take_along_axis(votes, np.where(exists, nearest, 0), axis=1) > 0)
-    at = bins(x, y)
-    return is_road.reshape(-1)[at], exists.reshape(-1)[at]
+    at, shown = bins(x, y), points[labels.in_view & np.isfinite(height_m)].astype(np.float64)
+    told = np.isin(np.arange(n_sectors), bins(shown[:, 0], shown[:, 1]) // n_rings)
+    return is_road.reshape(-1)[at], told[at // n_rings]

@@ -53,7 +53,7 @@ class OccupancyGrid:
     observed : (rows, columns) bool
         Cells that the scan observed (`edgeperc.ground.observed.Observer`).
     judged : (rows, columns) bool
-        Cells that the top view sees, or in whose direction points in view tell the road.
+        Cells that the top view sees, or in whose direction points are in view that know the road.
     cell_m : float
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float

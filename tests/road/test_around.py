@@ -18,6 +18,7 @@ VIEW = TopViewGeometry((-12.0, 12.0), (-8.0, 8.0), cell_m=0.8)
 def slow(points: NDArray[np.float32], labels: PointLabels, height_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """The same, cell by cell, (2, rows, columns)."""
     votes: dict[tuple[int, int], int] = {}
+    told = {place_of(*point[:2])[0] for point in points[labels.in_view].tolist()}
     for (x, y), label, seen, height in zip(
         points[:, :2].tolist(), labels.labels, labels.in_view, height_m, strict=True
     ):
@@ -31,7 +32,7 @@ def slow(points: NDArray[np.float32], labels: PointLabels, height_m: NDArray[np.
         for c, y in enumerate(ys.ravel().tolist()):
             sector, ring = place_of(x, y)
             rings = sorted((abs(other - ring), other) for s, other in votes if s == sector)
-            found[:, r, c] = bool(rings) and votes[sector, rings[0][1]] > 0, bool(rings)
+            found[:, r, c] = bool(rings) and votes[sector, rings[0][1]] > 0, sector in told
     return found
 
 
@@ -74,7 +75,7 @@ def test_labels_above_the_ground_and_out_of_view_do_not_count() -> None:
     points = np.array([[5.2, 0.4, 0.0, 0.0], [6.0, 0.4, 0.0, 0.0]], np.float32)
     labels = PointLabels(np.full(2, CLASSES.index("road"), np.uint8), np.array([True, False]), CLASSES)
     assert np.any(nearest_is_road(points, labels, np.zeros(2, np.float32), VIEW)[0])
-    assert not np.any(nearest_is_road(points, labels, np.array([1.0, 0.0], np.float32), VIEW))
+    assert not np.any(nearest_is_road(points, labels, np.array([1.0, 0.0], np.float32), VIEW)[0])
 
 
 def test_only_labels_with_a_road_know_it() -> None:
