@@ -209,7 +209,7 @@ def make_perceiver(
 
 def run_command(arguments: argparse.Namespace) -> int:
     """Perceive scans; return 1 if some failed."""
-    from ..readers.ports import is_port
+    from ..readers.ports import is_port, named
 
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     # What comes at a port is a live source, unless every scan is wanted.
@@ -224,7 +224,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     elif scans:
         check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
-    names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
+    names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)

@@ -16,7 +16,7 @@ from .livox_packets import LivoxStream, points_of
 from .mems_packets import MemsFormat, MemsStream, mems_format_of
 from .mirror_packets import MirrorStream, read_mirrors
 from .packets import Datagrams
-from .ports import named
+from .ports import is_port, named
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
     FORMATS,
@@ -51,7 +51,9 @@ def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tu
     if file is not None and (said is None or row.elevations_deg):
         return row, read_angles(file, row)
     if said is None:
-        there = "" if row.is_hesai else "The capture has no packet with the angles (DIFOP, port 7788). "
+        there = "" if row.is_hesai else "There is no packet with the angles (DIFOP, port 7788). "
+        if there and is_port(path):
+            there += f"Listen to its port, too: {path},7788. Or: "
         whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"
         raise PointsError(
             f"the angles of the lasers of this {row.title} are not known. {there}Put {whose} beside it, as "

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from capture_writers import write_pcap
-from lidar_writers import MODELS, blocks_of, calibration, packets_of, ranges, unit_angles
+from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
 
 from cli_helpers import Shell
 from edgeperc import PointsError, read_timed_scans, sensor_of, stream
@@ -91,6 +91,17 @@ def test_turns_at_a_port_are_those_of_a_capture(
             if len(whole) == 4:
                 break
     assert not np.array_equal(whole[0], whole[1])
+
+
+def test_where_the_angles_come_is_said(port: int, send: Sender) -> None:
+    model = MODELS["rs-32"]
+    send(packets_of(model, blocks_of(model, *ranges(model, PER_TURN))))
+    with pytest.raises(PointsError, match=rf"^udp:{port}: .* Listen to its port, too: udp:{port},7788"):
+        sensor_of(f"udp:{port}")
+    send([difop(model, unit_angles(model))])
+    sensor = sensor_of(f"udp:{port}")
+    assert sensor is not None
+    assert sensor.name == "rs-32"
 
 
 @pytest.mark.usefixtures("in_this_process")
