@@ -7,6 +7,7 @@ trained further. Input channels, classes and box channels that the model lacks s
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -30,6 +31,8 @@ from .checkpoint import read_checkpoint
 
 OUTPUT_LAYERS = {"classifier", "early", "predict"}
 """Layers that may lack classes or box channels, or have them in another order; of others, all or nothing is shared."""
+# Of the layers: networks of another structure have up to 0.19 in common by chance, those with another head 0.5 or more.
+FEWEST_SHARED = 0.3
 
 
 def start(
@@ -63,8 +66,14 @@ def start(
             value = _by_class(weight, own[name], card.classes, own_card.classes)
         if name in own and value is not None and value.shape == own[name].shape:
             common[name] = value
-    if not common:
-        raise ValueError(f"{path} has no weight in common with the network to train")
+    n_common, n_own, n_given = (sum(v.ndim > 1 for v in each.values()) for each in (common, own, given))
+    if card.view.kind != own_card.view.kind or n_common < FEWEST_SHARED * min(n_own, n_given):
+        raise ValueError(
+            f"{path} is of another network, with {n_common} of its {n_given} layers in common with this one; expected "
+            f"{recipe.network} with the same options, such as --edge and --width"
+        )
+    if unread := [name for name in card.input.channels if name not in own_card.input.channels]:
+        warnings.warn(f"{path} sees {', '.join(unread)} too, which the network to train does not", stacklevel=2)
     network.load_state_dict(common, strict=False)
     if folded:
         shared = {conv: norm for conv, norm in pairs.items() if f"{conv}.weight" in common}
@@ -125,7 +134,7 @@ def _by_channel(given: Tensor, own: Tensor, card: ModelCard, own_card: ModelCard
     """The weights of a convolution that reads the input, channel by channel, and those of channels made from it."""
     theirs, ours = card.input, own_card.input
     n_made = own.shape[1] - len(ours.channels)
-    if given.shape[0] != own.shape[0] or given.shape[1] - len(theirs.channels) != n_made:
+    if given[:, 0].shape != own[:, 0].shape or given.shape[1] - len(theirs.channels) != n_made:
         return None
     value = torch.zeros_like(own)
     value[:, len(ours.channels) :] = given[:, len(theirs.channels) :]
