@@ -40,12 +40,8 @@ DIRECTIONS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
 
 def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan]:
     """The unlabeled scans of the training drives without those of ``fold``; every label is `IGNORE`."""
-    scans = []
-    for name in objects.unlabeled("train", fold=fold):
-        points = read_points(objects.files(name)[0])
-        points = points[np.isfinite(points).all(axis=1)]
-        scans.append(LabeledScan.unlabeled(points))
-    return scans
+    clouds = [read_points(objects.files(name)[0]) for name in objects.unlabeled("train", fold=fold)]
+    return [LabeledScan.unlabeled(points[np.isfinite(points).all(axis=1)]) for points in clouds]
 
 
 def pseudo_labeled(
@@ -89,7 +85,15 @@ def teacher_network(checkpoint: Path, task: Task) -> nn.Module:
     )
     if task_of(recipe).view != task.view or not set(own) <= set(seen):
         raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
+    _check_classes(checkpoint, task_of(recipe).classes, task)
     return _OfChannels(build_network(state, checkpoint), [seen.index(channel) for channel in own]).eval()
+
+
+def _check_classes(path: Path, classes: Sequence[str], task: Task) -> None:
+    """Raise ValueError for a teacher of other classes; those that follow the road count as one (`Road`)."""
+    compared = classes[:2] if task.recipe.task == "road" else classes
+    if tuple(compared) != tuple(task.classes):
+        raise ValueError(f"{path} has the classes {', '.join(classes)}; expected {', '.join(task.classes)}")
 
 
 class OnnxTeacher:
@@ -101,10 +105,7 @@ class OnnxTeacher:
         self.path, self.card = path, ModelCard.read(path)
         if self.card.view != task.view:
             raise ValueError(f"{path} sees another view than {task.recipe.network}")
-        if task.recipe.task != "road" and self.card.classes != task.classes:
-            raise ValueError(
-                f"{path} has the classes {', '.join(self.card.classes)}; expected {', '.join(task.classes)}"
-            )
+        _check_classes(path, self.card.classes, task)
         self.mirror = task.recipe.seen_twice
         self.has_boxes = task.recipe.task == "vehicles" and task.recipe.head == "dense"
         if self.has_boxes and "box_dense" not in [output.kind for output in self.card.outputs]:
