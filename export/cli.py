@@ -32,11 +32,9 @@ SHARED: Mapping[str, Mapping[str, Any]] = {
         "type": Path,
         "help": "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes",
     },
-    "--semantickitti SEMANTICKITTI": {
-        "type": Path,
-        "help": "root folder of SemanticKITTI, to evaluate the drivable area",
-    },
-    "--camvid CAMVID": {"type": Path, "help": CAMVID},
+    "--semantickitti SEMANTICKITTI": {"type": Path, "help": "root of SemanticKITTI, to evaluate the drivable area"},
+    "--simulated SIMULATED": {"type": Path, "help": "folder of scans written by edgeperc-export simulate"},
+    "--camvid CAMVID": {"type": Path, "help": f"{CAMVID}; for networks of a camera"},
     "--fold FOLD": {
         "type": int,
         "help": "fold of the training drives (0, 1 or 2) to validate on instead of training on it",
@@ -47,11 +45,7 @@ SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated",
     },
     "--threads THREADS": {"type": positive, "help": "number of CPU threads (default: one for each core)"},
-    "--workers WORKERS": {
-        "type": count,
-        "default": 1,
-        "help": "number of processes that make the training samples (default 1)",
-    },
+    "--workers WORKERS": {"type": count, "default": 1, "help": "processes that make training samples (default 1)"},
     "--compile": {"help": "run the network through torch.compile, which needs a C++ compiler and a minute to start"},
     "--model-version MODEL_VERSION": {"default": "1.0.0", "help": "version to write into the card (default 1.0.0)"},
 }
@@ -196,9 +190,7 @@ def _add_train(command: Command) -> None:
     add("network", "network to train", choices=NETWORKS)
     add("out", "folder for checkpoint.pt, log.jsonl and log.csv; a checkpoint in it is resumed", type=Path)
     _add_shared(add, "--kitti KITTI", "--scans FOLDER[:LAYOUT]")
-    add("--simulated SIMULATED", "folder of scans written by edgeperc-export simulate", type=Path)
-    add("--camvid CAMVID", f"{CAMVID}; for networks of a camera", type=Path)
-    _add_shared(add, "--fold FOLD")
+    _add_shared(add, "--simulated SIMULATED", "--camvid CAMVID", "--fold FOLD")
     add(
         "--recipe",
         f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
@@ -278,20 +270,18 @@ def _add_export(command: Command) -> None:
 
 
 def _export(args: argparse.Namespace) -> None:
-    from .data.simulate import fitness_of, parity_samples
+    from .data.simulate import parity_samples
     from .release.to_onnx import export
     from .training.checkpoint import read_checkpoint
 
     metrics = json.loads(_json_text(args.metrics)) if args.metrics else None
-    trained = read_checkpoint(args.checkpoint)
-    task = trained["recipe"].task
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     card = export(
         args.checkpoint,
         args.out,
-        scans=parity_samples(task, args.scans),
-        fitness=None if task in ("camera", "objects") else trained["fitness"] or fitness_of(args.kitti),
+        scans=parity_samples(read_checkpoint(args.checkpoint)["recipe"].task, args.scans),
         metrics=metrics,
-        **keywords(args, "name", "licence", version="model_version"),
+        **keywords(args, "kitti", "name", "licence", version="model_version"),
     )
     print_line(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
 
@@ -304,10 +294,19 @@ def _add_verify(command: Command) -> None:
 
 
 def _verify(args: argparse.Namespace) -> None:
+    from edgeperc.types.card import ModelCard
+
+    from .cards import card_of
     from .data.simulate import parity_samples
     from .release.to_onnx import load, verify
 
     network, recipe, _ = load(args.checkpoint)
+    own, given = card_of(recipe, version="0"), ModelCard.read(args.model)
+    if (own.view, own.input, own.outputs, own.classes) != (given.view, given.input, given.outputs, given.classes):
+        raise CardMismatchError(
+            f"{args.model} is of another network or other options than {args.checkpoint}, {recipe.network}; expected "
+            "the model that was exported from it"
+        )
     print_line(json.dumps(verify(network, args.model, parity_samples(recipe.task, args.scans))))
 
 
@@ -397,6 +396,7 @@ def _quantize(args: argparse.Namespace) -> None:
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
     card = ModelCard.read(args.model)
+    args.out.parent.mkdir(parents=True, exist_ok=True)  # before minutes of work
     of_objects = card.view.kind == "objects"
     how = {"seven_bits": not args.eight_bits, "n_threads": args.threads}
     if card.view.kind == "camera":
@@ -404,11 +404,7 @@ def _quantize(args: argparse.Namespace) -> None:
             raise OptionError(f"{args.model} is of a camera; give --camvid to calibrate and evaluate it on")
         calibration = calibration_images(args.camvid)
     else:
-        sets = [
-            text
-            for text in args.scans
-            if (Path(text) / "scans.json").is_file() or (":" in text and not Path(text).exists())
-        ]
+        sets = [t for t in args.scans if (Path(t) / "scans.json").is_file() or (":" in t and not Path(t).exists())]
         calibration = calibration_scans(
             [Path(text) for text in args.scans if text not in sets],
             [ScanFolder.parse(text) for text in sets],
@@ -439,9 +435,7 @@ def _add_agree(command: Command) -> None:
     does = "compare bf16 and int8 with fp32, and write the agreement into the cards"
     add = options(command("agree", does, _agree))
     add("models MODEL...", "a network's name, or its files, one of them in fp32")
-    add("--kitti KITTI", "root of a KITTI object set", type=Path)
-    add("--semantickitti SEMANTICKITTI", "root of SemanticKITTI, for the road", type=Path)
-    add("--camvid CAMVID", f"{CAMVID}; for a network of a camera", type=Path)
+    _add_shared(add, "--kitti KITTI", "--semantickitti SEMANTICKITTI", "--camvid CAMVID")
     labeled = "labeled scans of any sensor: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
     add("--labeled FOLDER[:LAYOUT]", labeled, action="append", default=[])
     add("--split SPLIT", "drives of the scans, or images (default: validation)", default="validation")
@@ -467,8 +461,7 @@ def _add_make(command: Command) -> None:
     add("name", "model to make; the models that it starts from or is distilled from are made first", choices=shipped)
     add("out", "folder for scans, checkpoints and models; finished ones in it are kept", type=Path)
     _add_shared(add, "--kitti KITTI", "--layouts LAYOUTS", "--semantickitti SEMANTICKITTI")
-    add("--camvid CAMVID", f"{CAMVID}; for camseg", type=Path)
-    _add_shared(add, "--fold FOLD", "--scans FOLDER[:LAYOUT]")
+    _add_shared(add, "--camvid CAMVID", "--fold FOLD", "--scans FOLDER[:LAYOUT]")
     add("--steps STEPS", "training steps (default: as many as for the shipped model)", type=positive)
     _add_shared(add, "--threads THREADS", "--workers WORKERS", "--compile", "--model-version MODEL_VERSION")
 
@@ -501,8 +494,7 @@ def _add_ablate(command: Command) -> None:
     )
     add("out", "folder for the runs and their figures; finished runs in it are kept", type=Path)
     scans = options(ablate, "variants of a network")
-    _add_shared(scans, "--kitti KITTI")
-    scans("--simulated SIMULATED", "folder of scans from edgeperc-export simulate", type=Path)
+    _add_shared(scans, "--kitti KITTI", "--simulated SIMULATED")
     scans(
         "--start-from START_FROM",
         "checkpoint.pt, .onnx file or name of NETWORK-sim; lodnn starts from random weights",

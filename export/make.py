@@ -14,10 +14,11 @@ import onnx
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import NETWORK_ALONE, evaluate
 
-from .data.simulate import fitness_of, parity_samples, simulate
+from .data.simulate import parity_samples, simulate
 from .recipe import MODELS
 from .release.object_parity import object_figures
 from .release.to_onnx import export, write_card
+from .training.sources import check_used
 from .training.train import Data, Run, train
 
 N_SIMULATED = 2400
@@ -59,9 +60,8 @@ def make(
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
     fold, without_kitti = data.fold, stage.is_open or stage.recipe.simulated_share == 1.0
     evaluated = data
-    if recipe.task == "camera":
-        data, fold = Data(camvid=data.camvid), None
-    else:
+    check_used(recipe, data)
+    if recipe.task != "camera":
         if not without_kitti and (data.kitti is None or layouts is None):
             raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
         if without_kitti:
@@ -116,10 +116,8 @@ def finish(
     a JSON file beside it. If ``ssadnet-sim.onnx`` is in the same folder, its road is the ground truth of KITTI's scans.
     """
     stage, kitti, fold = MODELS[name], data.kitti, data.fold
-    task, fitness = stage.recipe.task, None
-    if task not in ("camera", "objects"):
-        fitness = fitness_of(None if stage.is_open or stage.recipe.simulated_share == 1.0 else kitti)
-    card = export(checkpoint, path, scans=parity_samples(task), fitness=fitness, name=name, version=version)
+    task = stage.recipe.task
+    card = export(checkpoint, path, scans=parity_samples(task), name=name, version=version)
     figures: dict[str, Any]
     if task == "camera":
         assert data.camvid is not None

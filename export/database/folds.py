@@ -18,7 +18,6 @@ import onnx
 
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import EdgepercError
-from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.types.card import ModelCard
 
 from ..data.roads import DatabaseError, mask_of, with_road
@@ -44,14 +43,14 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
     not made again. Stopped runs resume from ``work``. Raises DatabaseError.
     """
     made: dict[str, Path] = {}
+    if len(folds := {scene.fold for scene in drawn.values()}) < 2:
+        raise DatabaseError(
+            f"{len(drawn)} drawn scenes are in {len(folds)} of {N_FOLDS} folds, and the road model of a fold is made "
+            "of those of the others; draw roads in more drives, or give a model with --road-by NAME"
+        )
     for fold in range(N_FOLDS):
         trained_on = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
         held_out = {name: scene for name, scene in sorted(drawn.items()) if scene.fold == fold}
-        if not trained_on:
-            raise DatabaseError(
-                f"all {len(drawn)} drawn scenes are in fold {fold}, whose road model cannot be trained on them; draw "
-                "roads in two drives or more, or give a model with --road-by NAME"
-            )
         parts = [{name: asdict(scene) for name, scene in part.items()} for part in (trained_on, held_out)]
         key = hashlib.sha256(json.dumps([asdict(recipe), *parts], sort_keys=True).encode()).hexdigest()
         model, made_of = out / f"fold-{fold}.onnx", work / f"fold-{fold}.sha256"
@@ -69,9 +68,8 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
         given = Labeled([*scans.values()], [1.0] * len(scans), hashes)
         checkpoint = train(recipe, work / key, Data(given=(given, [*watched.values()])))
-        fitness = FitnessProfile.from_scans(scan.points for scan in scans.values())
         proof = [scan.points for scan in scans.values()][:4]
-        export(checkpoint, model, scans=proof, fitness=fitness, name=name)
+        export(checkpoint, model, scans=proof, name=name)
         made_of.write_text(key)
     for folder in work.iterdir():
         if folder.is_dir():

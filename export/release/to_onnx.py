@@ -26,7 +26,6 @@ from edgeperc.errors import CardMismatchError, EdgepercError, ModelFileError
 from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import IN_FLOAT32, WHOLE, Session, golden_feed, golden_input, golden_shape
-from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.frame import ModelFrame
@@ -37,6 +36,7 @@ from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeom
 from ..cards import card_of
 from ..data.scan_sets import seen_by_network
 from ..data.scans import LabeledScan
+from ..data.simulate import fitness_of
 from ..networks.lodnn import LoDNN
 from ..networks.objects import ObjectNet
 from ..networks.segnet import SegNet
@@ -87,7 +87,7 @@ class ParityError(EdgepercError):
 def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     """The averaged network of a checkpoint in inference mode, its recipe, and notes on its training."""
     state = read_checkpoint(checkpoint)
-    notes = {name: state[name] for name in ("frames", "n_simulated", "step", "before", "curve")}
+    notes = {name: state[name] for name in ("frames", "n_simulated", "step", "before", "curve", "fitness")}
     return build_network(state, checkpoint).eval(), state["recipe"], notes
 
 
@@ -371,16 +371,18 @@ def export(
     path: Path,
     *,
     scans: Sequence[NDArray[Any]],
-    fitness: FitnessProfile | None,
+    kitti: Path | None = None,
     name: str | None = None,
     version: str = "1.0.0",
     metrics: Mapping[str, Any] | None = None,
     licence: str = "Apache-2.0",
 ) -> ModelCard:
-    """Export a checkpoint, verify the file on scans, and write it with its card; ``fitness`` describes the training
-    scans, ``licence`` is of weights trained on simulation alone (others: `TERMS`). Raises ParityError.
+    """Export a checkpoint, verify the file on scans, and write it with its card; ``kitti``: scans to describe, of one
+    that does not describe its real ones; ``licence``: of weights trained on simulation alone (others: `TERMS`). Raises
+    ParityError.
     """
     network, recipe, notes = load(checkpoint)
+    fitness = None if recipe.task in ("camera", "objects") else notes.pop("fitness") or fitness_of(kitti)
     card = card_of(
         recipe,
         name=name or recipe.network,

@@ -78,11 +78,23 @@ def read_source(
     recipe: Recipe, folder: Path, data: Data, teacher: Path | None, n_workers: int, device: torch.device
 ) -> Source:
     """What a recipe's network learns from; samples of objects are kept in ``folder``. Raises ValueError."""
+    check_used(recipe, data, teacher)
     if recipe.task == "camera":
         return _image_source(recipe, data, device)
     if recipe.task == "objects":
         return _object_source(recipe, folder / OBJECT_SAMPLES, data, n_workers)
     return _scan_source(recipe, data, teacher, n_workers, device)
+
+
+def check_used(recipe: Recipe, data: Data, teacher: Path | None = None) -> None:
+    """Raise ValueError for data that a network does not learn from, which would be left out in silence."""
+    of_scans = {"kitti": data.kitti, "simulated": data.simulated, "scans": data.scan_sets or None, "fold": data.fold}
+    unused = {**of_scans, "teacher": teacher} if recipe.task == "camera" else {"camvid": data.camvid}
+    if recipe.task == "objects":
+        unused["teacher"] = teacher
+    for name, value in unused.items():
+        if value is not None:
+            raise ValueError(f"--{name} has no effect on {recipe.network}; leave it out")
 
 
 def _image_source(recipe: Recipe, data: Data, device: torch.device) -> Source:
@@ -135,7 +147,7 @@ def _scan_source(recipe: Recipe, data: Data, teacher: Path | None, n_workers: in
     if isinstance(teaches, nn.Module) and objects is not None and recipe.distil == 0.0:
         extra = unlabeled_scans(objects, data.fold)
         real = pseudo_labeled(teaches, task, [*real, *extra])
-        weights = [*weights, *[len(extra) ** -0.5] * len(extra)]
+        weights = [*weights, *(len(extra) ** -0.5 for _ in extra)]
     exported = teaches if isinstance(teaches, OnnxTeacher) else None
     samples = Samples(recipe, real, weights, paths, exported, n_workers)
     watch = Watch(samples, watched) if watched else None
