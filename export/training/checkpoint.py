@@ -64,8 +64,16 @@ def write_mean(paths: Sequence[Path], recipe: Recipe, out: Path) -> None:
     state = torch.load(paths[0], weights_only=True, map_location="cpu")
     weights = [build_network(read_checkpoint(path), path).state_dict() for path in paths]
     mean = {name: torch.stack([of[name] for of in weights]).mean(dim=0) for name in weights[0]}
-    with open_atomic(out) as file:
-        torch.save(state | {"recipe": json.dumps(asdict(recipe)), "averaged": mean, "best": None}, file)
+    write_checkpoint(state | {"recipe": json.dumps(asdict(recipe)), "averaged": mean, "best": None}, out)
+
+
+def write_checkpoint(state: Mapping[str, Any], path: Path) -> None:
+    """Write a checkpoint whole. Raises OSError, which torch hides behind one of its own if the disk is full."""
+    with open_atomic(path) as file:
+        try:
+            torch.save(state, file)
+        except RuntimeError as exc:
+            raise (exc.__context__ if isinstance(exc.__context__, OSError) else exc) from None
 
 
 def _recipe(text: str) -> Recipe:

@@ -15,8 +15,8 @@ from edgeperc.system.extras import require
 
 class TrainingLog:
     """Writes ``log.jsonl``, ``log.csv`` (names as of TensorBoard, ``validation/car``) and, if asked, event files into a
-    run's folder, where a run that is resumed after ``step`` goes on: lines of later steps, which it makes again, are
-    removed. Raises MissingExtraError.
+    run's folder, where a run that is resumed after ``step`` goes on: lines of later steps, which it makes again, or of
+    another run, are removed. Raises MissingExtraError.
     """
 
     def __init__(self, folder: Path, step: int = 0, *, tensorboard: bool = False) -> None:
@@ -24,10 +24,10 @@ class TrainingLog:
         if tensorboard:
             require("tensorboard", "tensorboard", "--tensorboard")
             writer = require("torch.utils.tensorboard", "tensorboard", "--tensorboard").SummaryWriter
-            self._events = writer(str(folder), purge_step=step + 1 if step else None)
+            self._events = writer(str(folder), purge_step=step + 1)
         path, self._table = folder / "log.jsonl", folder / "log.csv"
         if path.exists():
-            kept = [line for line in whole_lines(path) if not step or line["step"] <= step]
+            kept = [line for line in whole_lines(path) if line["step"] <= step]
             write_atomic(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
             self._table.unlink(missing_ok=True)
             for line in kept:
@@ -88,8 +88,6 @@ def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
     rows = whole_lines(path) if path.is_file() else []
     if not rows:
         raise ValueError(f"{path} has no line; expected the folder of a training run")
-    # A run that began anew in its folder repeats steps.
-    rows = list({row["step"]: row for row in rows}.values())
     names = [name for name in rows[-1].get("validation", {}) if name != "background"]
     size = -(-len(rows) // max(1, n_lines))
     yield f"{run}: {len(rows)} lines of the log, means of {size}"
@@ -102,10 +100,8 @@ def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
 
     for first in range(0, len(rows), size):
         part = rows[first : first + size]
-        cells = [
-            f"{part[-1].get('samples', part[-1]['step']):>12,}",
-            f"{sum(r['loss'] for r in part) / len(part):>12.4f}",
-        ]
+        n_seen, loss = part[-1].get("samples", part[-1]["step"]), sum(r["loss"] for r in part) / len(part)
+        cells = [f"{n_seen:>12,}", f"{loss:>12.4f}"]
         cells += [f"{value:>12.1f}" if (value := mean(part, name)) is not None else f"{'-':>12}" for name in names]
         yield "".join(cells)
     quarter = len(rows) // 4

@@ -24,13 +24,12 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from edgeperc.datasets.layout import BACKGROUND
-from edgeperc.system.atomic import open_atomic
 
 from ..data.scan_sets import joined_hashes
 from ..networks import build
 from ..recipe import Recipe
 from .bfloat16 import in_bfloat16
-from .checkpoint import read_checkpoint, write_mean
+from .checkpoint import read_checkpoint, write_checkpoint, write_mean
 from .log import TrainingLog
 from .object_batches import ObjectBatches
 from .ranks import Ranks
@@ -257,27 +256,26 @@ class _Training:
 
     def _save(self) -> None:
         state, samples = self.state, self.source.samples
-        with open_atomic(self.checkpoint) as file:
-            torch.save(
-                {
-                    "recipe": json.dumps(asdict(self.recipe)),
-                    "before": json.dumps(state.before),
-                    "step": state.step,
-                    "network": self.network.state_dict(),
-                    "averaged": self.averaged.state_dict(),
-                    "best": state.best,
-                    "watched": (state.best_figure, state.lowest_loss, state.since_best, state.halvings),
-                    "optimizer": self.optimizer.state_dict(),
-                    "curve": json.dumps(state.curve),
-                    "frames": json.dumps(state.hashes),
-                    "made_of": json.dumps(self.made_of),
-                    "fitness": json.dumps(self.source.fitness),
-                    "fold": -1 if self.fold is None else self.fold,
-                    "n_simulated": len(samples.simulated),
-                    "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
-                },
-                file,
-            )
+        write_checkpoint(
+            {
+                "recipe": json.dumps(asdict(self.recipe)),
+                "before": json.dumps(state.before),
+                "step": state.step,
+                "network": self.network.state_dict(),
+                "averaged": self.averaged.state_dict(),
+                "best": state.best,
+                "watched": (state.best_figure, state.lowest_loss, state.since_best, state.halvings),
+                "optimizer": self.optimizer.state_dict(),
+                "curve": json.dumps(state.curve),
+                "frames": json.dumps(state.hashes),
+                "made_of": json.dumps(self.made_of),
+                "fitness": json.dumps(self.source.fitness),
+                "fold": -1 if self.fold is None else self.fold,
+                "n_simulated": len(samples.simulated),
+                "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
+            },
+            self.checkpoint,
+        )
 
     def _resume(self) -> None:
         kept = read_checkpoint(self.checkpoint, self.ranks.device)
