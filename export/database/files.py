@@ -210,14 +210,19 @@ class TopViewDatabase:
         return (self[k] for k in range(len(self)))
 
     def damaged(self) -> list[str]:
-        """Files of the scenes that are missing, or differ from the hash in the index."""
-        bad = []
-        for row in self.rows:
-            for folder, suffix in (("image", "png"), ("label", "txt"), ("map", "png")):
-                path = self.root / f"{folder}s" / f"{row['scene']}.{suffix}"
-                if not path.exists() or hashlib.sha256(path.read_bytes()).hexdigest() != row[f"{folder}_sha256"]:
-                    bad.append(str(path.relative_to(self.root)))
-        return bad
+        """Files of scenes and of drawn roads that are missing, or differ from the hash in their index."""
+        index, kinds = "road/index.csv", (("image", "png"), ("label", "txt"), ("map", "png"))
+        files = {f"{kind}s/{row['scene']}.{end}": row[f"{kind}_sha256"] for row in self.rows for kind, end in kinds}
+        bad_index = _digest(self.root / index) != self.manifest["sha256"].get(index)
+        roads = () if bad_index else csv.DictReader(io.StringIO((self.root / index).read_text()))
+        drawn = [(row, kind) for row in roads if row["scene"] in self._at for kind in ("image", "mask")]
+        files |= {f"road/{kind}s/{row['name']}.png": row[f"{kind}_sha256"] for row, kind in drawn}
+        bad = [name for name, digest in files.items() if _digest(self.root / name) != digest]
+        return bad + [index] * bad_index
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def _belongs(row: dict[str, str], split: str, fold: int | None) -> bool:
