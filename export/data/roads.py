@@ -217,17 +217,8 @@ def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: 
             area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2.0
             low, size = (float(x.min()), float(y.min())), (float(np.ptp(x)), float(np.ptp(y)))
             flat = [round(float(v), 2) for corner in polygon for v in corner]
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": k,
-                    "category_id": 1,
-                    "segmentation": [flat],
-                    "bbox": [round(v, 2) for v in (*low, *size)],
-                    "area": round(area, 2),
-                    "iscrowd": 0,
-                }
-            )
+            shape = {"segmentation": [flat], "bbox": [round(v, 2) for v in (*low, *size)], "area": round(area, 2)}
+            annotations.append({"id": len(annotations) + 1, "image_id": k, "category_id": 1, **shape, "iscrowd": 0})
     content = {"images": images, "categories": [{"id": 1, "name": "road"}], "annotations": annotations}
     return json.dumps(content, indent=1) + "\n"
 

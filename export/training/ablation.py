@@ -99,16 +99,8 @@ def ablate(
         last = whole_lines(folder / "log.jsonl")[-1]
         if "validation" not in last:
             raise ValueError(f"{data.kitti} has no scan of fold {data.fold} to evaluate on; give another --fold")
-        rows.append(
-            {
-                "network": network,
-                "variant": variant,
-                "fold": data.fold,
-                "steps": steps,
-                "scans": recipe.steps * recipe.batch,
-                "figures": last["validation"],
-            }
-        )
+        run_of = {"network": network, "variant": variant, "fold": data.fold, "steps": steps}
+        rows.append({**run_of, "scans": recipe.steps * recipe.batch, "figures": last["validation"]})
         write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
     return rows
 

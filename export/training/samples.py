@@ -75,9 +75,7 @@ class Samples:
         self.paste_odds |= {name: OWN_ODDS for name in recipe.classes[1:] if name not in POINT_CLASSES}
         # A top view's road goes on under a pole, but not through a wall.
         self.negatives = NEGATIVES if recipe.task == "points" else {"pole": 1.0}
-        settings = {
-            field.name: getattr(recipe, field.name) for field in fields(Augmentation) if hasattr(recipe, field.name)
-        }
+        settings = {f.name: getattr(recipe, f.name) for f in fields(Augmentation) if hasattr(recipe, f.name)}
         self.augmentation = Augmentation(odds=self.paste_odds, negatives=self.negatives, **settings)
         self.bank: ObjectBank | None = None
         if max(recipe.n_pasted, recipe.n_negatives) > 0.0:
