@@ -19,7 +19,7 @@ Image = pytest.importorskip("PIL.Image")
 
 import torch.nn.functional as F
 from torch import nn
-from training_helpers import interrupted_in_step, train
+from training_helpers import interrupted_in_step, make, train
 
 from cli_helpers import Shell
 from edgeperc.errors import ImageError, PointsError, SplitError
@@ -399,6 +399,8 @@ def test_the_papers_protocol_keeps_the_best_epoch(drawn: Path, tmp_path: Path) -
     assert state["best"] is not None
     with pytest.raises(ValueError, match="give --camvid"):
         train(Recipe("camseg"), tmp_path / "none")
+    with pytest.raises(ValueError, match="--fold has no effect on camseg; leave it out"):
+        make("camseg", tmp_path, camvid=drawn, fold=1)
 
 
 def test_comparison_resumes_network_by_network(drawn: Path, tmp_path: Path) -> None:
@@ -437,7 +439,7 @@ def trained(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     folder = tmp_path_factory.mktemp("camseg")
     recipe = replace(Recipe("camseg"), **{**SMALL, "image_width": 64, "image_height": 48, "steps": 30, "ema": 0.5})
     checkpoint = train(recipe, folder, camvid=drawn)
-    export(checkpoint, folder / "camseg.onnx", scans=parity_samples("camera"), fitness=None)
+    export(checkpoint, folder / "camseg.onnx", scans=parity_samples("camera"))
     return checkpoint, folder / "camseg.onnx"
 
 

@@ -349,7 +349,9 @@ def test_wrong_usage_of_the_reader_is_explained(out: Path, tmp_path: Path) -> No
     shutil.copytree(out, tmp_path / "copy")
     (tmp_path / "copy/maps/000002.png").write_bytes(b"no image")
     (tmp_path / "copy/labels/000003.txt").unlink()
-    assert TopViewDatabase(tmp_path / "copy").damaged() == ["maps/000002.png", "labels/000003.txt"]
+    for road in (f"road/masks/{min((out / 'road/masks').iterdir()).name}", "road/index.csv"):
+        (tmp_path / "copy" / road).write_bytes(b"cut short")
+        assert TopViewDatabase(tmp_path / "copy").damaged() == ["maps/000002.png", "labels/000003.txt", road]
     assert main(["database-check", str(tmp_path / "copy")]) == 1
     with pytest.raises(DatabaseError, match="is not an image"):
         TopViewDatabase(tmp_path / "copy").scene("000002")
@@ -404,8 +406,9 @@ def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Pa
     assert (again.made, again.kept, contents(plan.out)) == (0, 8, first)
 
     path.write_text(write_coco({"000000": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
-    with pytest.raises(DatabaseError, match="draw roads in two drives"):
+    with pytest.raises(DatabaseError, match=r"1 drawn scenes are in 1 of 5 folds, .*; draw roads in more drives"):
         build(plan, polygons=[path], recipe=recipe, workers=1)
+    assert contents(plan.out) == first  # nothing was trained before
 
 
 class PowerFailure(BaseException):

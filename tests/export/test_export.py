@@ -71,7 +71,7 @@ from edgeperc_export.release.to_onnx import (
 )
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
-from edgeperc_export.training.checkpoint import read_checkpoint
+from edgeperc_export.training.checkpoint import read_checkpoint, write_checkpoint
 from edgeperc_export.training.samples import Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Points, task_of
@@ -148,10 +148,9 @@ def untrained(network: str, folder: Path, **changes: object) -> Path:
     with torch.no_grad():
         for _ in range(2):
             net(torch.rand(1, len(task.input.channels), task.view.height, task.view.width))
-    state = {k: v for k, v in net.state_dict().items()}
     path = folder / f"{network}-{recipe.head}.pt"
     notes = {"frames": "{}", "before": "[]", "curve": "[]", "n_simulated": 2, "step": 0}
-    torch.save({"averaged": state, "best": None, "recipe": json.dumps(recipe.__dict__), **notes}, path)
+    torch.save({"averaged": net.state_dict(), "best": None, "recipe": json.dumps(recipe.__dict__), **notes}, path)
     return path
 
 
@@ -222,6 +221,8 @@ def test_a_run_may_keep_a_share_of_the_weights_that_it_starts_from(tmp_path: Pat
         train(replace(recipes[0], kept=0.5), tmp_path / "none", simulated=simulated)
     with pytest.raises(ValueError, match="of a run with another --start-from; give the same or"):
         train(recipes[1], tmp_path / "0.25", simulated=simulated, start_from=tmp_path / "0.0/checkpoint.pt")
+    with pytest.raises(OSError, match="No space left"):
+        write_checkpoint(weights(begun), Path("/dev/full"))
 
 
 @pytest.mark.usefixtures("small_views")
@@ -339,8 +340,12 @@ def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Pat
     for name, value in slots.state_dict().items():
         origin = given.get(name) if name.startswith("segmentation") else before[name]
         assert torch.equal(value, origin), name
-    with pytest.raises(ValueError, match="no weight in common"):
-        start(build(small("pointseg")), small("pointseg"), dense, [])
+    recipe = small("pointseg", edge=True)
+    for network, changes in (("ssadnet", {"edge": True}), ("pointseg", {}), ("pointseg", {"edge": True, "width": 0.5})):
+        with pytest.raises(ValueError, match=r"is of another network, .* as --edge"):
+            start(build(recipe), recipe, untrained(network, tmp_path, **changes), [])
+    with pytest.warns(UserWarning, match="sees height_above_ground too"):
+        start(build(recipe), recipe, untrained("pointseg", tmp_path, edge=True, height_above_ground=True), [])
 
 
 SHIPPED_MODELS = REPOSITORY / "models"
@@ -394,7 +399,7 @@ def as_tuple(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 )
 def test_classes_of_a_start_keep_their_weights(simulated: Path, classes: tuple[str, ...]) -> None:
     """As many classes, or in another order, as well: they took the weights in the place of theirs."""
-    recipe = Recipe("pointseg", edge=True, batch=1, classes=classes)
+    recipe = Recipe("pointseg", edge=True, height_above_ground=True, batch=1, classes=classes)
     image, labels = samples_of(recipe, simulated).batch(0)
     assert set(np.unique(labels)) <= {0, 2, len(classes) - 1, IGNORE}  # cars are of no class of this one
 
@@ -415,8 +420,8 @@ def test_classes_of_a_start_keep_their_weights(simulated: Path, classes: tuple[s
 @pytest.mark.usefixtures("small_views")
 def test_a_start_shares_whole_layers_or_none(tmp_path: Path) -> None:
     """Of a narrower network, batch norm got zeros for the channels that it lacks, which then stayed zero."""
-    network, recipe = build(small("pointseg", edge=True)), small("pointseg", edge=True)
-    start(network, recipe, untrained("pointseg", tmp_path, edge=True, width=0.5), [])
+    network, recipe = build(small("ssadnet", context_width=16)), small("ssadnet", context_width=16)
+    start(network, recipe, untrained("ssadnet", tmp_path, context_width=8), [])
     assert all(module.running_var.all() for module in network.modules() if isinstance(module, nn.BatchNorm2d))
     with pytest.raises(ModelError, match="is in int8, without most weights in fp32; give the model in fp32"):
         start(network, recipe, SHIPPED_MODELS / "pointseg-int8.onnx", [])
@@ -533,7 +538,8 @@ def test_the_learning_rate_is_halved_after_epochs_without_improvement(
 ) -> None:
     monkeypatch.setattr(Watch, "validate", lambda self, network: (0.5, 1.0, {"car": 0.5}))
     recipe = small("pointseg", edge=True, steps=4, halve_after=2, n_pasted=0.0)
-    state = read_checkpoint(train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, checkpoint_every=1))
+    data = {"kitti": kitti, "simulated": simulated, "fold": 1, "teacher": untrained("pointseg", tmp_path, edge=True)}
+    state = read_checkpoint(train(recipe, tmp_path, **data, checkpoint_every=1))  # no scan is unlabeled
     assert state["watched"][-1] == 1  # at step 3, two epochs of one step after the first and best
     assert state["optimizer"]["param_groups"][0]["lr"] < 0.6 * recipe.learning_rate
 
@@ -620,6 +626,12 @@ def test_an_unused_or_unsuitable_teacher_is_refused(tmp_path: Path, simulated: P
         (small("pointseg", n_pasted=0.0), points, "the teacher is not used; give --distil"),
         (small("lodnn", distil=1.0, n_pasted=0.0), points, "is of pointseg, which sees another view than lodnn"),
         (small("ssadnet", edge=True, distil=1.0, n_pasted=0.0), slots, "the teacher has no dense boxes"),
+        (
+            small("pointseg", distil=1.0, classes=("background", "car")),
+            points,
+            "has the classes background, .* expected",
+        ),
+        (small("objects"), points, "--teacher has no effect on objects; leave it out"),
     ):
         with pytest.raises(ValueError, match=message):
             train(recipe, tmp_path, simulated=simulated, teacher=teacher)
@@ -754,6 +766,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
         "edgeperc eval KITTI simulation --model pointseg-full --fold 0 --no-agreement",
     ]
     assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
+    assert cards[1].fitness == read_checkpoint(made.with_suffix("") / "checkpoint.pt")["fitness"].to_dict()
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
     taught = make("pointseg", out, fold=0, **arguments)
     assert len(evaluated) == 3  # the teacher of this fold was made already
@@ -849,8 +862,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarra
         with pytest.MonkeyPatch.context() as patch:
             make_views_small(patch)
             checkpoint, path = untrained(network, folder, head=head), folder / "model.onnx"
-            fitness = FitnessProfile.from_scans(scans)
-            return checkpoint, path, export(checkpoint, path, scans=scans, fitness=fitness, version="0.0.1")
+            patch.setattr(to_onnx, "fitness_of", lambda _: FitnessProfile.from_scans(scans))
+            return checkpoint, path, export(checkpoint, path, scans=scans, version="0.0.1")
 
     return of
 
@@ -905,7 +918,7 @@ def test_a_graph_that_disagrees_is_not_written(
 
     monkeypatch.setattr(to_onnx, "to_graph", broken)
     with pytest.raises(ParityError, match=r"raw outputs differ by \S+ standard deviations"):
-        export(checkpoint, path, scans=scans, fitness=None)
+        export(checkpoint, path, scans=scans)
     assert path.read_bytes() == b"the model before"
     assert [p.name for p in tmp_path.iterdir()] == ["model.onnx"]
     network = load(checkpoint)[0]
@@ -1064,18 +1077,16 @@ def test_weights_have_the_terms_of_their_scans() -> None:
     assert terms_of(sets_of([])) == ""
     assert terms_of(sets_of(["pandaset/002_00", "pandaset/002_01"])).startswith("CC BY 4.0")
     assert terms_of(sets_of(["lyft/7", "000001"])) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
-    assert terms_of(sets_of(["pandaset/002_00", "000001"])).startswith(
-        "KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's"
-    )
+    both = terms_of(sets_of(["pandaset/002_00", "000001"]))
+    assert both.startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
     assert terms_of(sets_of(["mine/1"])) == "mine: terms of that set"
-    assert terms_of(sets_of(["0001TP_000001", "yard/1"], camera=True)).endswith(
-        "; images of another set: terms of that set"
-    )
+    both = terms_of(sets_of(["0001TP_000001", "yard/1"], camera=True))
+    assert both.endswith("; images of another set: terms of that set")
 
 
 @pytest.mark.usefixtures("small_views")
 def test_the_command_line_from_scans_to_a_model(tmp_path: Path, shell: Shell) -> None:
-    data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "pointseg.onnx"
+    data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "models/pointseg.onnx"
     shell.out("simulate", data, "-n", "2")
     shell.out("simulate", tmp_path, "-n", "1", "--sensor", "vlp-16", "--where", "yard")
     yard = simulated_scan(0, "vlp-16", where="yard", clumped_leaves=True)
@@ -1087,6 +1098,8 @@ def test_the_command_line_from_scans_to_a_model(tmp_path: Path, shell: Shell) ->
     assert "parity" in shell.out("export", run / "checkpoint.pt", model)
     shown = shell.out("verify", run / "checkpoint.pt", model)
     assert '"n_scans": 4' in shown
+    said = shell.err("verify", run / "checkpoint.pt", "pointseg")
+    assert "pointseg.onnx is of another network or other options than" in said
     assert Session(model, "cpu").card.fitness is not None
 
 
