@@ -117,7 +117,6 @@ def test_a_run_of_packets_ends_with_silence_or_where_they_are_taken_too_late(
     source: Path, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And the next one begins with what comes then."""
-    monkeypatch.setattr(ports, "SILENCE_S", 0.3)
     monkeypatch.setattr(ports, "FIRST_S", 0.1)
     signs, read = list[int](), list[bytes]()
     ports.listen(source)
