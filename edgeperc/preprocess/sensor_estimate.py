@@ -659,8 +659,8 @@ def _match(beams: Beams) -> Match:
             off = np.abs(way * beams.elevations_deg[:, None] - known)
             nearest, off_deg = off.argmin(axis=1), off.min(axis=1)
             is_run = np.ptp(nearest) < _MOST_MISSED * n and len(np.unique(nearest)) == n
-            # Of beams that are closer than this, any would fit.
-            fits = is_run and off_deg.max() <= min(_UNIT_DEG, profile.median_gap_deg / 3.0)
+            # Where all beams are closer than that, any would fit.
+            fits = is_run and off_deg.max() <= min(_UNIT_DEG, float(np.abs(np.diff(known)).max()) / 3.0)
             if name == "hdl-64e" and not fits and _is_above(beams, way):
                 # As the profile has them, seen from the origin, the elevations depend on the distances.
                 seen = np.sort(way * beams.seen_deg)[::-1]

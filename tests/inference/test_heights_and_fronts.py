@@ -66,7 +66,7 @@ def exported(
     def of(recipe: Recipe) -> tuple[Path, ModelCard]:
         folder = tmp_path_factory.mktemp("exported")
         path = folder / "model.onnx"
-        return path, export(untrained(recipe, folder / "checkpoint.pt"), path, scans=scans, fitness=None)
+        return path, export(untrained(recipe, folder / "checkpoint.pt"), path, scans=scans)
 
     return of
 

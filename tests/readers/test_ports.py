@@ -178,10 +178,17 @@ def test_files_of_a_unit_have_the_number_of_the_first_port(text: str, file: str)
     assert ports.named(Path("a/drive.pcap")) == Path("a/drive.pcap")
 
 
-def test_a_group_is_joined(port: int) -> None:
+def test_what_is_sent_to_a_group_is_read(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "FIRST_S", 0.1)
     path = Path(f"udp:239.255.0.7:{port}")
-    try:
-        ports.listen(path)
-    except PointsError:
-        pytest.skip("this computer has no network with multicast")
-    ports.release(path)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        try:
+            one.sendto(b"before", ("239.255.0.7", port))
+        except OSError:
+            pytest.skip("this computer has no network for groups")
+        try:
+            ports.listen(path)
+            one.sendto(b"to all", ("239.255.0.7", port))
+            assert [bytes(each.payload) for each in Datagrams(path, silent)] == [b"to all"]
+        finally:
+            ports.release(path)
