@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from cli_helpers import Shell
 from edgeperc import PointsError, read_timed_scans, sensor_of, stream
 from edgeperc.readers import ports
 from edgeperc.readers.packets import Datagrams
-from edgeperc.system.remote import location
 
 Sender = Callable[[Sequence[bytes]], None]
 MODEL = MODELS["pandar40p"]
@@ -172,7 +170,7 @@ def test_a_port_at_which_nothing_comes_is_said(source: Path, monkeypatch: pytest
     [("udp:2368", "2368"), ("udp://:2368", "2368"), ("udp:6699,7788", "6699"), ("udp:239.0.0.5:7502", "7502")],
 )
 def test_files_of_a_unit_have_the_number_of_the_first_port(text: str, file: str) -> None:
-    path: Any = location(text)
+    path = Path(text)
     assert ports.is_port(path)
     assert ports.named(path) == Path(file)
     assert ports.named(Path("a/drive.pcap")) == Path("a/drive.pcap")

@@ -239,6 +239,7 @@ def test_what_needs_an_order_is_refused(scans: Path, tmp_path: Path, option: str
 
 def test_paths_stay_paths(tmp_path: Path) -> None:
     assert location("a/b.bin") == Path("a/b.bin")
+    assert location("udp://:2368") == Path("udp://:2368")
     assert location(tmp_path.as_uri()) == tmp_path
     assert location("s3://bucket/a/") == Remote("s3://bucket/a")
     url = Remote("s3://bucket/a/0.pcd.bin")
