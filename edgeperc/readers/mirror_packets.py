@@ -89,16 +89,18 @@ class MirrorStream:
         if len(payload) != self._size:
             return
         row, mirrors = self._row, self._mirrors
-        places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
-        motor = [256 * hundredths + fine for hundredths, fine in (_MOTOR.unpack_from(payload, at) for at in places)]
-        at = [mirrors.at(angle) for angle in motor]
-        for mirror in dict.fromkeys(at):
+        angles = (_MOTOR.unpack_from(payload, at) for at in row.blocks_at)
+        motor = [256 * hundredths + fine for hundredths, fine in angles]
+        seen = [mirrors.at(angle) for angle in motor]
+        for mirror in dict.fromkeys(seen):
             if mirror < 0:
                 continue
             if mirror != self._mirror or len(self._packets) >= _MOST_PACKETS:
                 yield from self.end()
             self._mirror = mirror
-            self._packets.append(_Packet(bytes(payload), time_of(row, payload), motor, [each == mirror for each in at]))
+            self._packets.append(
+                _Packet(bytes(payload), time_of(row, payload), motor, [each == mirror for each in seen])
+            )
 
     def end(self) -> Iterator[TimedScan]:
         """The last frame, which may be a part."""
@@ -107,7 +109,7 @@ class MirrorStream:
             return
         row = self._row
         content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
-        blocks = content[:, row.header : row.header + row.n_blocks * row.block_bytes].reshape(-1, row.block_bytes)
+        blocks = content[:, row.header : row.blocks_at.stop].reshape(-1, row.block_bytes)
         returns = blocks[:, row.first :].reshape(len(packets), row.n_blocks, _N_LASERS, row.channel_bytes)
         units = returns[..., 0].astype(np.int64) | returns[..., 1].astype(np.int64) << 8
         motor = np.array([each.motor for each in packets])

@@ -48,7 +48,8 @@ def is_port(path: Path) -> bool:
 
 def named(path: Path) -> Path:
     """A capture as the files beside it are called: those of ports have the number of the first one, here."""
-    return Path((_SOURCE.fullmatch(str(path)) or ["", "", "0"])[2].partition(",")[0]) if is_port(path) else path
+    match = _SOURCE.fullmatch(str(path))
+    return Path(match[2].partition(",")[0]) if match else path
 
 
 def listen(path: Path) -> Listener:

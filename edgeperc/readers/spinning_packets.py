@@ -66,6 +66,11 @@ class Format(NamedTuple):
         """From one block to the next."""
         return self.first + self.n_channels * self.channel_bytes
 
+    @property
+    def blocks_at(self) -> range:
+        """Where the blocks of a packet begin."""
+        return range(self.header, self.header + self.n_blocks * self.block_bytes, self.block_bytes)
+
 
 class Angles(NamedTuple):
     """What is known of a unit: (lasers, 2) elevation and azimuth of each laser [deg], its speed, and returns."""
@@ -229,8 +234,7 @@ def _with_options(row: Format, options: int, size: int) -> Format:
 
 
 def _has_flags(payload: memoryview, row: Format) -> bool:
-    places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
-    return not row.flag or all(bytes(payload[at : at + len(row.flag)]) == row.flag for at in places)
+    return not row.flag or all(bytes(payload[at : at + len(row.flag)]) == row.flag for at in row.blocks_at)
 
 
 def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
@@ -374,8 +378,7 @@ class SpinningStream:
     def azimuths_of(self, payload: memoryview) -> list[float]:
         """The azimuths of a packet's blocks [deg]; NaN where one is impossible."""
         row = self._row
-        places = range(row.header, row.header + row.n_blocks * row.block_bytes, row.block_bytes)
-        hundredths = [struct.unpack_from(f"{self._order}H", payload, at + row.first - 2)[0] for at in places]
+        hundredths = [struct.unpack_from(f"{self._order}H", payload, at + row.first - 2)[0] for at in row.blocks_at]
         return [0.01 * each if each < 36_000 else np.nan for each in hundredths]
 
     def _packet(self, payload: memoryview) -> _Packet:
@@ -422,7 +425,7 @@ def _blocks(row: Format, packets: Sequence[_Packet]) -> Floats:
     azimuths = np.array([packet.azimuths for packet in packets])
     speeds = 6.0 * np.array([packet.rpm for packet in packets])
     order = "<" if row.is_hesai else ">"
-    at = row.header + row.reference % row.n_blocks * row.block_bytes + row.first - 2
+    at = row.blocks_at[row.reference] + row.first - 2
     references = 0.01 * np.array([struct.unpack_from(f"{order}H", packet.content, at)[0] for packet in packets])
     ahead_deg = (azimuths - references[:, None] + _HALF_TURN_DEG) % 360.0 - _HALF_TURN_DEG
     times_s = np.array([packet.time_s for packet in packets])[:, None] + 1e-6 * row.late_us
