@@ -100,6 +100,7 @@ FLOORS = {
         view.__init__
         datasets.__init__ datasets.annotations datasets.images datasets.splits
         datasets.kitti datasets.layout
+        datasets.trees
         datasets.scan_folder
         live warm_up
         perceiver

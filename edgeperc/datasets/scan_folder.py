@@ -12,7 +12,8 @@
 
 A scan is labeled if it has at least one of the three label files. ``layouts/`` next to this module has descriptions of
 public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
-``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``.
+``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``. With a name of `trees.TREES`, a folder
+without ``velodyne`` is the root of that set, as it is downloaded.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ from .layout import (
     point_names_of,
     read_layout,
 )
+from .trees import TREES, Tree
 
 __all__ = ["ScanFolder", "ScanFrame"]
 
@@ -207,12 +209,19 @@ class ScanFolder:
                     f"(docs/howto/train.md), or name a public set: FOLDER:{', FOLDER:'.join(known_layouts())}"
                 )
         self.layout = layout if isinstance(layout, ScanLayout) else read_layout(layout)
-        self.scans = self._scans()
-        self._annotated = read_datumaro(self.root / BOX_FILES["cvat"]) if self.layout.box_format == "cvat" else {}
-        self.drives = self._drives()
+        self._point_numbers: Bytes | None = None
+        self._tree: Tree | None = None
+        if self.layout.files in TREES and (self.root / "velodyne").is_dir():
+            self.layout = replace(self.layout, files="plain")
+        if self.layout.files in TREES:
+            self._tree = TREES[self.layout.files](self.root)
+            self.scans, self.drives = self._tree.scans, self._tree.drives
+        else:
+            self.scans = self._scans()
+            self._annotated = read_datumaro(self.root / BOX_FILES["cvat"]) if self.layout.box_format == "cvat" else {}
+            self.drives = self._drives()
         if isinstance(layout, Path) and layout == self.root / "scans.json":
             self._check_splits()
-        self._point_numbers: Bytes | None = None
 
     @classmethod
     def parse(cls, text: str | Path) -> ScanFolder:
@@ -239,6 +248,11 @@ class ScanFolder:
         """
         if name not in self.drives:
             raise PointsError(f"{self.root} has no labeled scan {name!r}; its names are those of the files in velodyne")
+        if self._tree is not None:
+            points, labeled, numbers, polygons = self._tree.read(name)
+            checked = None if labeled is None else self._checked(labeled, self.scans[name])
+            of_points = None if numbers is None else self._classes_of(numbers, self.scans[name])
+            return ScanFrame(name, self.drives[name], self.layout, points, checked, of_points, polygons)
         points = read_points(self.scans[name])
         calibration = unlabeled = boxes = image_labels = None
         path = self._path("boxes", name)
@@ -250,12 +264,9 @@ class ScanFolder:
             kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
             image_labels = kitti.KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
-            # A copy would be an object that nothing can find. Two files of Argoverse 2 have one, of a car each.
-            boxes = self._renamed([*dict.fromkeys(self._read_boxes(path, name))], path)
-            if huge := [box for box in boxes if box.label != IGNORED and max(box.size) >= kitti.LARGEST_M]:
-                raise PointsError(f"{path}: a {huge[0].label} of {max(huge[0].size):g} m; expected less than 100 m")
+            boxes = self._checked(self._read_boxes(path, name), path)
         classes, area = self._path("points", name), self._path("drivable", name)
-        point_classes = None if classes is None else self._read_classes(classes, len(points))
+        point_classes = None if classes is None else self._classes_of(kitti.read_numbers(classes, len(points)), classes)
         drivable = None if area is None else _read_polygons(area)
         of_image = calibration, unlabeled, image_labels
         return ScanFrame(name, self.drives[name], self.layout, points, boxes, point_classes, drivable, *of_image)
@@ -347,13 +358,21 @@ class ScanFolder:
             return read_sustechpoints(path)
         return _read_boxes(path, self.layout.box_columns)
 
+    def _checked(self, boxes: Sequence[Box], path: Path) -> tuple[Box, ...]:
+        """Boxes with the classes of the description, each once."""
+        # A copy would be an object that nothing can find. Two files of Argoverse 2 have one, of a car each.
+        renamed = self._renamed([*dict.fromkeys(boxes)], path)
+        if huge := [box for box in renamed if box.label != IGNORED and max(box.size) >= kitti.LARGEST_M]:
+            raise PointsError(f"{path}: a {huge[0].label} of {max(huge[0].size):g} m; expected less than 100 m")
+        return renamed
+
     def _renamed(self, boxes: Sequence[Box], path: Path) -> tuple[Box, ...]:
         """Boxes with the classes of the description; boxes of background are left out."""
         renamed = (replace(box, label=class_of_name(box.label, self.layout.boxes, path, "boxes")) for box in boxes)
         return tuple(box for box in renamed if box.label != BACKGROUND)
 
-    def _read_classes(self, path: Path, n_points: int) -> Bytes:
-        raw = kitti.read_numbers(path, n_points)
+    def _classes_of(self, raw: NDArray[Any], path: Path) -> Bytes:
+        """Index into the description's classes of each point, by the numbers of a label file."""
         if self._point_numbers is None:
             self._point_numbers = self._numbers()
         numbers = np.unique(raw)
@@ -369,7 +388,9 @@ class ScanFolder:
     def _numbers(self) -> Bytes:
         """Raw number of a class -> index into the description's classes, `IGNORE` if it has no name."""
         names, source = self.layout.point_names, self.root / "semseg_classes.json"
-        if names is None:
+        if names is None and self._tree is not None:
+            names = self._tree.point_names
+        elif names is None:
             document = read_json(source, object, "names by number, or point_names in the description")
             names = point_names_of(document, str(source))
         classes = point_class_names(self.layout)

@@ -1,0 +1,344 @@
+"""Public sets as they are downloaded: nuScenes' tables, and Argoverse 2's logs."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..readers.files import read_points
+from ..system.extras import require
+from ..types.frame import poses_of, turned
+from ..types.perception import Box
+from ..types.points import Floats, Points
+from .annotations import read_json
+from .kitti import read_numbers
+from .layout import point_names_of
+
+_Row = TypeVar("_Row")
+_Annotation = tuple[str, Any, Any, Any]  # class, translation, rotation and size of a box, as nuScenes has them
+_Posed = tuple[str, Floats, list[float]]  # class, pose, and width, length and height of a box
+_TOP = "LIDAR_TOP"
+_WITH_RIDER = ".with_rider"
+_BYTE = 255.0  # Argoverse 2's intensities, which its profile has as 0..1
+
+
+class Labeled(NamedTuple):
+    """A scan with x ahead, and what its set says of it; None where it says nothing."""
+
+    points: Points
+    boxes: list[Box] | None  # with the classes of the set
+    numbers: NDArray[Any] | None  # of the points' classes
+    drivable: tuple[Floats, ...] | None
+
+
+class Tree:
+    """The labeled scans of a set: their files and drives by name, and the names of points' classes by number."""
+
+    scans: dict[str, Path]
+    drives: dict[str, str]
+    point_names: Mapping[int, str]
+
+    def read(self, name: str) -> Labeled:
+        """Read a scan and its labels. Raises PointsError."""
+        raise NotImplementedError
+
+
+class NuScenes(Tree):
+    """The key frames of one LiDAR in nuScenes' tables (Caesar et al., 2020), which Lyft Level 5 and TIER IV's T4 have,
+    too: ``ROOT/VERSION/*.json``, or those of ``ROOT`` itself. A bicycle with a rider has a class of its own.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._tables = _folder_of_tables(root)
+        self._root = self._tables.parent
+        self._frames = self._there()
+        self.scans = {name: self._root / frame.filename for name, (frame, _) in self._frames.items()}
+        scenes = self._texts("scene", "name")
+        samples = dict(self._rows("sample", lambda row: (_text(row["token"]), scenes[row["scene_token"]])))
+        used = {frame.ego_pose_token for frame, _ in self._frames.values()}
+        egos = dict(
+            self._rows(
+                "ego_pose",
+                lambda row: (row["token"], _pose(row["translation"], row["rotation"])),
+                lambda row: row["token"] in used,
+            )
+        )
+        try:
+            self.drives = {name: samples[frame.sample_token] for name, (frame, _) in self._frames.items()}
+            self._egos = {name: egos[frame.ego_pose_token] for name, (frame, _) in self._frames.items()}
+        except KeyError as exc:
+            raise PointsError(f"{self._tables}: sample_data.json names a row {exc} that is not there") from exc
+        self._boxes, numbered = self._annotated(), lambda row: (str(row["index"]), row["name"])
+        named = dict(self._rows("category", numbered, lambda row: "index" in row))
+        self.point_names = point_names_of(named, str(self._tables / "category.json"))
+        self._numbers: dict[str, str] = {}
+        if named and (self._tables / "lidarseg.json").is_file():
+            files = self._rows("lidarseg", lambda row: (_text(row["sample_data_token"]), _text(row["filename"])))
+            self._numbers = dict(files)
+        if self._boxes is None and not self._numbers:
+            raise PointsError(f"{self._tables} has no labels; expected rows in sample_annotation.json or lidarseg.json")
+
+    def read(self, name: str) -> Labeled:
+        """Read a scan, turned until x is ahead, and its labels. Raises PointsError."""
+        frame, sensor = self._frames[name]
+        ahead = math.atan2(sensor[1, 0], sensor[0, 0])
+        points = read_points(self.scans[name])
+        into = _about_z(ahead) @ np.linalg.inv(self._egos[name] @ sensor)
+        boxes = None
+        if self._boxes is not None:
+            rows = self._boxes.get(frame.sample_token, ())
+            try:
+                boxes = [_box(kind, _pose(place, turn), size, into) for kind, place, turn, size in rows]
+            except (TypeError, ValueError) as exc:
+                raise PointsError(
+                    f"{self._tables / 'sample_annotation.json'}: a box of {name} is none ({exc})"
+                ) from exc
+        file = self._numbers.get(frame.token)
+        numbers = None if file is None else read_numbers(self._root / file, len(points))
+        return Labeled(turned(points, -ahead) if ahead else points, boxes, numbers, None)
+
+    def _there(self) -> dict[str, tuple[_Frame, Floats]]:
+        """The key frames whose files are there, by the name of the file, and the pose of their LiDAR in the vehicle."""
+        modalities, channels_of = self._texts("sensor", "modality"), self._texts("sensor", "channel")
+        lidars = {token: channel for token, channel in channels_of.items() if modalities[token] == "lidar"}
+        channels = sorted({*lidars.values()})
+        if _TOP not in channels and len(channels) != 1:
+            raise PointsError(f"{self._tables} has LiDARs {', '.join(channels) or 'none'}; expected one, or {_TOP}")
+        channel = _TOP if _TOP in channels else channels[0]
+        poses = dict(
+            self._rows(
+                "calibrated_sensor",
+                lambda row: (_text(row["token"]), _pose(row["translation"], row["rotation"])),
+                lambda row: lidars.get(row["sensor_token"]) == channel,
+            )
+        )
+        frames = self._rows(
+            "sample_data",
+            lambda row: _Frame(*(_text(row[key]) for key in _Frame._fields)),
+            lambda row: row["is_key_frame"] and row["calibrated_sensor_token"] in poses,
+        )
+        there = {_stem(frame.filename): frame for frame in frames if (self._root / frame.filename).is_file()}
+        if len(there) < len(frames):
+            lacking = next(frame.filename for frame in frames if there.get(_stem(frame.filename)) is not frame)
+            told = f"{self._root}: of {len(frames):,} labeled scans {len(there):,} are there, and not {lacking}"
+            if not there:
+                raise PointsError(f"{told}; expected the set's files beside its tables")
+            warnings.warn(f"{told}; the others are left out", stacklevel=5)
+        if not there:
+            raise PointsError(f"{self._tables}: no key frame of a LiDAR; expected some in sample_data.json")
+        return {name: (frame, poses[frame.calibrated_sensor_token]) for name, frame in there.items()}
+
+    def _annotated(self) -> dict[str, list[_Annotation]] | None:
+        """The boxes by sample; None for a set without labels."""
+        if not (self._tables / "sample_annotation.json").is_file():
+            return None
+        attributes, categories = self._texts("attribute", "name"), self._texts("category", "name")
+        instances = self._texts("instance", "category_token")
+        wanted = {frame.sample_token for frame, _ in self._frames.values()}
+
+        def labeled(row: dict[str, Any]) -> tuple[str, _Annotation]:
+            ridden = any(attributes[token].endswith(_WITH_RIDER) for token in row["attribute_tokens"])
+            kind = categories[instances[row["instance_token"]]] + (_WITH_RIDER if ridden else "")
+            return row["sample_token"], (kind, row["translation"], row["rotation"], row["size"])
+
+        boxes = dict[str, list[_Annotation]]()
+        for sample, box in self._rows("sample_annotation", labeled, lambda row: row["sample_token"] in wanted):
+            boxes.setdefault(sample, []).append(box)
+        return boxes or None  # a test set's table is empty
+
+    def _rows(
+        self, table: str, row_of: Callable[[dict[str, Any]], _Row], is_wanted: Callable[[dict[str, Any]], bool] = bool
+    ) -> list[_Row]:
+        """What is wanted of the rows of a table, of which one alone is kept at a time: some have gigabytes."""
+        path = self._tables / f"{table}.json"
+
+        def wanted(row: dict[str, Any]) -> Any:
+            if "token" not in row:  # a part of a row
+                return row
+            return (row_of(row),) if is_wanted(row) else None
+
+        try:
+            with path.open(encoding="utf-8") as file:
+                rows = json.load(file, object_hook=wanted)
+            if not isinstance(rows, list) or not all(row is None or isinstance(row, tuple) for row in rows):
+                raise TypeError("no list of rows with a token")  # JSON has no tuples
+            return [row for (row,) in filter(None, rows)]
+        except (OSError, RecursionError, UnicodeDecodeError, json.JSONDecodeError) as exc:
+            raise PointsError(f"{path} cannot be read ({exc}); expected a table of nuScenes") from exc
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
+            raise PointsError(
+                f"{path} has a row that is not nuScenes' ({exc!r:.100}); expected docs/schema of its devkit"
+            ) from exc
+
+    def _texts(self, table: str, key: str) -> dict[str, str]:
+        """A text of each row, by token."""
+        return dict(self._rows(table, lambda row: (_text(row["token"]), _text(row[key]))))
+
+
+class _Frame(NamedTuple):
+    token: str
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    filename: str
+
+
+class Argoverse2(Tree):
+    """The labeled sweeps of Argoverse 2's sensor set (Wilson et al., 2021), in ``ROOT/LOG`` or ``ROOT/SPLIT/LOG``. The
+    origin is that of the upper LiDAR, the axes are the vehicle's, and intensities are 0..1.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.point_names = {}
+        logs = [path.parent for depth in ("", "*/", "*/*/") for path in root.glob(f"{depth}annotations.feather")]
+        if not logs:
+            raise PointsError(f"{root} has no annotations.feather; expected LOG/annotations.feather, or SPLIT/LOG")
+        self.scans, self.drives = dict[str, Path](), dict[str, str]()
+        for log in sorted(logs):
+            for stamp in np.unique(_feather(log / "annotations.feather", "timestamp_ns")["timestamp_ns"]).tolist():
+                path = log / "sensors" / "lidar" / f"{stamp}.feather"
+                if path.is_file():
+                    self.scans[f"{log.name}_{stamp}"], self.drives[f"{log.name}_{stamp}"] = path, log.name
+        if not self.scans:
+            raise PointsError(f"{root} has no labeled sweeps; expected files LOG/sensors/lidar/STAMP.feather")
+
+    def read(self, name: str) -> Labeled:
+        """Read a sweep and its labels. Raises PointsError."""
+        path = self.scans[name]
+        try:
+            return self._read(path, int(path.stem), _log(path.parents[2]))
+        except PointsError:
+            raise
+        except (TypeError, ValueError) as exc:
+            raise PointsError(f"{path.parents[2]}: {exc}") from exc
+
+    def _read(self, path: Path, stamp: int, log: _Log) -> Labeled:
+        columns = _feather(path, "x", "y", "z", "intensity")
+        points = np.column_stack([*columns.values()]).astype(np.float64)
+        points = ((points - [*log.lidar_m, 0.0]) / [1.0, 1.0, 1.0, _BYTE]).astype(np.float32)
+        into = np.eye(4)
+        into[:3, 3] = -log.lidar_m
+        drivable = None
+        if log.areas is not None and stamp in log.egos:
+            here = into @ np.linalg.inv(log.egos[stamp])
+            drivable = tuple(area @ here[:3, :3].T + here[:3, 3] for area in log.areas)
+        return Labeled(points, [_box(*row, into) for row in log.boxes.get(stamp, ())], None, drivable)
+
+
+class _Log(NamedTuple):
+    """A log: place of the upper LiDAR in the vehicle's frame, its boxes and the vehicle's pose by the time of a sweep,
+    and the drivable areas of the map.
+    """
+
+    lidar_m: Floats
+    boxes: Mapping[int, list[_Posed]]
+    egos: Mapping[int, Floats]
+    areas: list[Floats] | None
+
+
+@lru_cache(maxsize=2)
+def _log(folder: Path) -> _Log:
+    place, turn = ("tx_m", "ty_m", "tz_m"), ("qx", "qy", "qz", "qw")
+    sensors = _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", "sensor_name", *place)
+    names = sensors.pop("sensor_name").tolist()
+    if "up_lidar" not in names:
+        raise PointsError(f"{folder} has no calibration of up_lidar; expected it in egovehicle_SE3_sensor.feather")
+    boxes = dict[int, list[_Posed]]()
+    sizes = ("width_m", "length_m", "height_m")
+    rows = _feather(folder / "annotations.feather", "timestamp_ns", "category", *sizes, *place, *turn)
+    poses = _poses(rows, place, turn)
+    for k, (stamp, kind) in enumerate(zip(rows["timestamp_ns"].tolist(), rows["category"].tolist(), strict=True)):
+        boxes.setdefault(stamp, []).append((kind, poses[k], [float(rows[size][k]) for size in sizes]))
+    areas, egos = None, dict[int, Floats]()
+    for path in folder.glob("map/log_map_archive_*.json"):
+        egos_of = _feather(folder / "city_SE3_egovehicle.feather", "timestamp_ns", *place, *turn)
+        egos = dict(zip(egos_of["timestamp_ns"].tolist(), _poses(egos_of, place, turn), strict=True))
+        try:
+            rings = [area["area_boundary"] for area in read_json(path)["drivable_areas"].values()]
+            areas = [np.array([[corner[axis] for axis in "xyz"] for corner in ring], np.float64) for ring in rings]
+        except (AttributeError, KeyError, TypeError, ValueError) as exc:
+            raise PointsError(f"{path} is not a map of Argoverse 2 ({exc!r:.100}); expected drivable_areas") from exc
+    lidar = names.index("up_lidar")
+    return _Log(np.array([sensors[axis][lidar] for axis in place], np.float64), boxes, egos, areas)
+
+
+def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
+    """Columns of a table. Raises PointsError."""
+    arrow = require("pyarrow", "argoverse", f"{path}: a Feather file")
+    feather = require("pyarrow.feather", "argoverse", f"{path}: a Feather file", package="pyarrow")
+    try:
+        table = feather.read_table(path, columns=list(columns), memory_map=False)
+        table.validate(full=True)
+        return {name: table.column(name).to_numpy() for name in columns}
+    except (OSError, arrow.ArrowException, KeyError, ValueError) as exc:
+        raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc
+
+
+def _folder_of_tables(root: Path) -> Path:
+    """The folder of the tables of one version."""
+    found = sorted(path.parent for depth in ("", "*/") for path in root.glob(f"{depth}sample_data.json"))
+    if len(found) != 1:
+        versions = ", ".join(path.name for path in found)
+        raise PointsError(
+            f"{root} has tables of {versions}; pass the folder of one, such as {found[0]}"
+            if found
+            else f"{root} has no tables of nuScenes; expected VERSION/sample_data.json beside samples/"
+        )
+    return found[0]
+
+
+def _stem(filename: str) -> str:
+    return Path(filename).name.removesuffix(".bin").removesuffix(".pcd")
+
+
+def _pose(translation: Iterable[Any], rotation: Iterable[Any]) -> Floats:
+    """Matrix (4, 4) of x, y, z [m] and a quaternion w, x, y, z."""
+    (w, *xyz), (east, north, up) = map(float, rotation), map(float, translation)
+    (pose,) = _matrices(np.array([[east, north, up]]), np.array([[*xyz, w]]))
+    return pose
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r:.40} in place of a text")
+    return value
+
+
+def _poses(columns: Mapping[str, NDArray[Any]], place: Sequence[str], turn: Sequence[str]) -> Floats:
+    """Matrices (n, 4, 4) of a table."""
+    return _matrices(
+        *(np.column_stack([columns[name] for name in names]).astype(np.float64) for names in (place, turn))
+    )
+
+
+def _matrices(positions: Floats, quaternions: Floats) -> Floats:
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    if not (quaternions.shape[1] == 4 and np.isfinite(positions).all() and (np.abs(norms - 1.0) < 0.1).all()):
+        raise ValueError("a pose that is not finite, or whose quaternion has not the length 1")
+    return poses_of(positions, quaternions / norms)
+
+
+def _about_z(angle_rad: float) -> Floats:
+    return poses_of(np.zeros((1, 3)), np.array([[0.0, 0.0, math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)]]))[0]
+
+
+def _box(kind: str, pose: Floats, size: Iterable[float], into: Floats) -> Box:
+    """An upright box of a pose in the world; ``size`` is width, length, height."""
+    there = into @ pose
+    (x, y, z), (width, length, height) = there[:3, 3].tolist(), map(float, size)
+    if not 0.0 < min(width, length, height) <= max(width, length, height) < math.inf:
+        raise ValueError(f"a {kind!r:.60} of {width:g} x {length:g} x {height:g} m; expected sizes above 0")
+    return Box(kind, 1.0, (x, y, z), (length, width, height), math.atan2(there[1, 0], there[0, 0]))
+
+
+TREES: Mapping[str, Callable[[Path], Tree]] = {"nuscenes": NuScenes, "argoverse2": Argoverse2}
+"""What reads a set in its own tree, by ``files`` of its description."""
