@@ -489,19 +489,19 @@ def _suiting_models(
     from ..preprocess.fitness import FitnessProfile
     from ..zoo import listed
 
-    rows: list[tuple[str, str]] = []
+    said: dict[str, list[str]] = {}  # of which models
     findings: dict[str, list[str] | None] = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
         if card.view.kind in ("camera", "objects"):  # objects are of any scan
             continue
-        if card.fitness is None:
-            findings[card.name] = None
-            rows.append((card.name, "its card does not describe its training scans"))
-            continue
-        fitness = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor.upright(sensor.mounting), frame)
-        sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
+        sentences, texts = None, ["its card does not describe its training scans"]
+        if card.fitness is not None:
+            profile = FitnessProfile.from_dict(card.fitness)
+            fitness = check_fitness(scan, profile, sensor.upright(sensor.mounting), frame)
+            sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
+            texts = [f"as a scan of {sensor.name}: {sentence}" for sentence in sentences]
         findings[card.name] = sentences
-        rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in sentences]
-        if not sentences:
-            rows.append((card.name, f"suits this scan, taken as one of {sensor.name}"))
+        for text in texts or [f"suits this scan, taken as one of {sensor.name}"]:
+            said.setdefault(text, []).append(card.name)
+    rows = [("models", f"{', '.join(names)}: {text}") for text, names in said.items()]
     return rows, findings

@@ -116,14 +116,17 @@ def test_info_of_a_scan(tmp_path: Path, shell: Shell, monkeypatch: pytest.Monkey
     monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
     np.save(tmp_path / "scan.npy", points)
-    rows = rows_of(shell.out("info", tmp_path / "scan.npy", "--sensor", "os1-64"))
+    out = shell.out("info", tmp_path / "scan.npy", "--sensor", "os1-64")
+    rows = rows_of(out)
     assert rows["points"] == "4, of which 1 are not finite"
     assert rows["extent"] == "x -6.0 .. 3.0, y 0.0 .. 10.0, z 0.0 .. 10.0 m"
     assert rows["range"] == "5.0 .. 14.1 m, median 10.0 m"
     assert rows["remission"].startswith("min 10, 5 % ")
     assert rows["beams"].endswith("rows of points (os1-64: 64)")
-    assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
-    assert rows["ssadnet"].startswith("its card does not describe")
+    of_models = [line.split(None, 1)[1] for line in out.splitlines() if line.startswith("models ")]
+    assert "pointseg: as a scan of os1-64: it has 32 beams" in of_models
+    assert any("ssadnet: its card does not describe its training scans" in text for text in of_models)
+    assert len({text.partition(": ")[2] for text in of_models}) == len(of_models)
     ((scaled, profile, sensor),) = checked
     np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
     assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
