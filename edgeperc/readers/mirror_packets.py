@@ -79,6 +79,7 @@ class MirrorStream:
 
     def __init__(self, row: Format, mirrors: Mirrors) -> None:
         self._row, self._mirrors = row, mirrors
+        self._off = np.moveaxis(mirrors.off, 2, 0).copy()
         self._packets, self._mirror, self._size = list[_Packet](), -1, 0
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
@@ -119,20 +120,22 @@ class MirrorStream:
         times_s = np.array([each.time_s for each in packets])[:, None] - 1e-6 * late_us
         fired_s = times_s[..., None] + 1e-6 * np.array(row.fires_us)
         shown = (units > 0) & np.array([each.shown for each in packets])[..., None]
-        p, b, laser = np.nonzero(shown)
-        azimuth, elevation = self._directions(motor[p, b], laser)
+        azimuth, elevation = (angles[shown] for angles in np.moveaxis(self._directions(motor), 2, 0))
         ranges = 1e-3 * packets[0].content[row.mm_at] * units[shown]
         flat = ranges * np.cos(elevation)
         values = (flat * np.sin(azimuth), flat * np.cos(azimuth), ranges * np.sin(elevation), returns[..., 2][shown])
-        scan = np.stack(values, axis=1).astype(np.float32)
-        yield TimedScan(float(fired_s[shown].max() if len(p) else times_s[0, 1]), scan, fired_s[shown])
+        scan, fired_s = np.stack(values, axis=1).astype(np.float32), fired_s[shown]
+        yield TimedScan(float(fired_s.max() if len(scan) else times_s[0, 1]), scan, fired_s)
 
-    def _directions(self, motor: Ints64, laser: Ints64) -> Floats:
-        """(2, n) azimuth and elevation [rad]; a mirror turns a ray by twice its own angle."""
+    def _directions(self, motor: Ints64) -> Floats:
+        """Azimuth and elevation of each laser [rad], (packets, blocks, 2, lasers), by the motor's angle; a mirror turns
+        a ray by twice its own.
+        """
         step, rest = np.divmod(motor, _STEP)
-        share = rest / _STEP
-        near, far = (self._mirrors.off[:, laser, (step + k) % _N_STEPS] for k in (0, 1))
+        share = (rest / _STEP)[..., None, None]
+        near, far = (self._off[(step + k) % _N_STEPS] for k in (0, 1))
         off = (1.0 - share) * near + share * far
-        swept = 2 * (motor - self._mirrors.begins[self._mirror])
-        azimuth, elevation = self._mirrors.lasers[:, laser]
-        return np.radians(np.stack([swept - azimuth, elevation]) + off) / _DEGREE
+        azimuth, elevation = self._mirrors.lasers
+        swept = 2 * (motor - self._mirrors.begins[self._mirror])[..., None]
+        exact = np.stack(np.broadcast_arrays(swept - azimuth, elevation), axis=2)
+        return np.radians(exact + off) / _DEGREE

@@ -215,7 +215,7 @@ class OusterStream:
         name = (remission_field or "reflectivity").upper()
         if name not in layout.fields:
             raise PointsError(f"there is no field {name!r} for the remission, only {', '.join(sorted(layout.fields))}")
-        self._layout = layout
+        self._layout, self._rays = layout, _rays(layout)
         self._fields = np.array([layout.fields["RANGE"], layout.fields[name]], np.int64)
         self._ids = 1 << 8 * layout.frame_id[1]
         self._now: int | None = None  # the turn that packets are collected of
@@ -272,25 +272,35 @@ class OusterStream:
         values = np.zeros((2, *self._layout.shape), np.uint32)
         stamps_ns = np.zeros(self._layout.shape[1], np.uint64)
         fill_turn(table, np.array(self._layout.places), self._fields, values, stamps_ns)
-        return _scan_of(values[0].ravel(), values[1].ravel(), stamps_ns, self._layout)
+        return _scan_of(values[0].ravel(), values[1].ravel(), stamps_ns, self._rays)
+
+
+def _rays(layout: Layout) -> tuple[Floats, Floats]:
+    """Of each pixel, beam by beam (n, 3): direction [m/mm] and begin [m] of its ray, from which ranges count, as
+    Ouster's manuals state them: columns turn clockwise from behind.
+    """
+    encoder = -2.0 * np.pi / layout.shape[1] * np.arange(layout.shape[1])
+    heading, altitude = encoder - layout.azimuth[:, None], np.broadcast_to(layout.altitude[:, None], layout.shape)
+    x, z = layout.to_lidar[0, 3], layout.to_lidar[2, 3]
+    flat = np.cos(altitude)
+    directions = np.stack([flat * np.cos(heading), flat * np.sin(heading), np.sin(altitude)], axis=-1)
+    axis = np.stack([x * np.cos(encoder), x * np.sin(encoder), np.full(len(encoder), z)], axis=-1)
+    begins = axis - (np.hypot(x, z) if z else x) * directions
+    turn, place = layout.to_sensor[:3, :3].T, layout.to_sensor[:3, 3]
+    return (_METER * directions @ turn).reshape(-1, 3), (_METER * (begins @ turn + place)).reshape(-1, 3)
 
 
 def _scan_of(
-    range_mm: NDArray[np.uint32], remission: NDArray[np.uint32], stamps_ns: NDArray[np.uint64], layout: Layout
+    range_mm: NDArray[np.uint32],
+    remission: NDArray[np.uint32],
+    stamps_ns: NDArray[np.uint64],
+    rays: tuple[Floats, Floats],
 ) -> TimedScan:
-    """The returns of a turn, beam by beam, as Ouster's manuals state it: columns turn clockwise from behind."""
+    """The returns of a turn, beam by beam."""
     returned = np.flatnonzero(range_mm)
-    beam, column = returned // layout.shape[1], returned % layout.shape[1]
-    encoder = -2.0 * np.pi / layout.shape[1] * column
-    heading, altitude = encoder - layout.azimuth[beam], layout.altitude[beam]
-    x, z = layout.to_lidar[0, 3], layout.to_lidar[2, 3]
-    ray_mm = range_mm[returned] - (np.hypot(x, z) if z else x)
-    flat_mm = ray_mm * np.cos(altitude)
-    xyz_mm = np.empty((len(returned), 3))
-    xyz_mm[:, 0] = flat_mm * np.cos(heading) + x * np.cos(encoder)
-    xyz_mm[:, 1] = flat_mm * np.sin(heading) + x * np.sin(encoder)
-    xyz_mm[:, 2] = ray_mm * np.sin(altitude) + z
+    directions, begins = (np.take(of_pixels, returned, axis=0) for of_pixels in rays)
     scan = np.empty((len(returned), 4), np.float32)
-    scan[:, :3] = _METER * (xyz_mm @ layout.to_sensor[:3, :3].T + layout.to_sensor[:3, 3])
+    scan[:, :3] = range_mm[returned, None] * directions + begins
     scan[:, 3] = remission[returned]
-    return TimedScan(float(stamps_ns.max()) * 1e-9, scan, stamps_ns[column].astype(np.float64) * 1e-9)
+    times_s = stamps_ns.astype(np.float64) * 1e-9
+    return TimedScan(float(times_s.max()), scan, times_s[returned % len(times_s)])
