@@ -106,8 +106,9 @@ class GroundFit:
         mask = np.empty(len(wanted), np.bool_)
         if self.planes is not None:
             level = np.empty((N_CELLS, N_CELLS), np.float32)
-            fill_levels(self.points, self.lowest, self.planes, wanted, self.cell, level)
-            fill_heights(self.points, wanted, self.cell, level, self.planes, max_height_m, height, mask)
+            planes = read_only(self.planes, np.float64)  # as they come from another process that shares its memory
+            fill_levels(self.points, self.lowest, planes, wanted, self.cell, level)
+            fill_heights(self.points, wanted, self.cell, level, planes, max_height_m, height, mask)
         else:
             fill_heights_above_plane(self.points, wanted, self.plane, max_height_m, height, mask)
             mask &= self.found

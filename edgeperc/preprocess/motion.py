@@ -19,8 +19,8 @@ from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import fill_moved, pose_between, poses_of, quaternion
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
-from ..types.points import Floats, Floats32, Points, as_points, check_each, read_only
-from ..types.rigid import numbers_of, rigid
+from ..types.points import Floats, Floats32, Points, as_points, read_only
+from ..types.rigid import numbers_of, rigid, times_of
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
@@ -33,7 +33,6 @@ MIN_STEP_M, MIN_WAY_M = 1.0, 5.0  # of a trajectory, until its directions of tra
 FASTEST_MPS = 150.0  # of a trajectory; trains are slower
 UPRIGHT, FORWARD, SAME_WAY = 0.7, 0.7, 0.95  # cosines: z is up, x is ahead; the way keeps its direction in the sensor
 OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
-COARSEST_S = 0.002  # of times: 0.06 m at 30 m/s
 LONGEST_GAP_S = 2.0  # between poses of a moving sensor: whoever stands still may write none
 LONGEST_S = 60.0  # of a constant motion; a tenth of a second in nanoseconds would be three years of standing still
 
@@ -336,17 +335,10 @@ def deskew(
     """
     rows = as_points(points)
     seen = blank_too_near(rows, OPTIONS.number("min_range_m", min_range_m, 0.0))
-    moments = numbers_of("got times that are not numbers", times, PointsError, f"({len(rows)},) seconds")
-    check_each(len(rows), times=moments)
+    moments = times_of(times, len(rows))
     if not isinstance(motion, Motion):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion")
     known = moments[np.isfinite(moments)]
-    coarse_s = np.spacing(np.abs(known).max(initial=0.0).astype(np.float32))
-    if getattr(times, "dtype", None) == np.float32 and coarse_s > COARSEST_S:
-        raise StampError(
-            f"got times in float32 of {known.max():.6g} s, which it holds to {coarse_s:.2g} s; expected float64, or "
-            "seconds since the start of the scan"
-        )
     at = (float(known.max()) if len(known) else 0.0) if at_s is None else as_seconds(at_s, "at_s")
     if not math.isfinite(at):
         raise StampError(f"at_s is {at_s}; expected finite seconds")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..errors import OptionError, PointsError, StampError
 from ..system.clock import as_seconds
 from ..system.fields import OPTIONS
-from ..types.points import Floats, Mask, Points, as_points, check_each
-from ..types.rigid import numbers_of
+from ..types.points import Floats, Mask, Points, as_points
+from ..types.rigid import times_of
 from ..types.sensor import MAX_ACCUMULATE_S, MIN_ACCUMULATE_S
 
 if TYPE_CHECKING:
@@ -217,13 +217,14 @@ def accumulate(
     PointsError
         A scan is not points, or has not one time for each of them.
     StampError
-        A scan has neither times nor a finite stamp, or no pose of a trajectory is near its times.
+        A scan has neither times nor a finite stamp, or no pose of a trajectory is near its times. Or they are
+        beyond 1e12 s, or in a float32 that rounds them by milliseconds.
     OptionError
         ``accumulate_s`` is not 0.01 to 10 s, or ``motion`` is neither.
     """
     from ..preprocess.motion import Motion, Trajectory, deskew  # numba, which bags do without
 
-    OPTIONS.number("accumulate_s", accumulate_s, MIN_ACCUMULATE_S, MAX_ACCUMULATE_S)
+    accumulate_s = OPTIONS.number("accumulate_s", accumulate_s, MIN_ACCUMULATE_S, MAX_ACCUMULATE_S)
     if not isinstance(motion, Motion | Trajectory | None):
         raise OptionError(f"motion is {motion!r:.200}; expected a Motion, a Trajectory or None")
 
@@ -251,9 +252,8 @@ def accumulate(
                 )
             times_s = np.full(len(points), stamp_s)
         points = as_points(points)
-        times_s = numbers_of("got times that are not numbers", times_s, PointsError, "seconds")
-        check_each(len(points), times_s=times_s)
-        if not np.isfinite(times_s).any():
+        times_s = times_of(times_s, len(points))
+        if np.isnan(times_s).all():
             continue
         first_s, newest_s = float(np.nanmin(times_s)), float(np.nanmax(times_s))
         if not kept or newest_s < end_s:

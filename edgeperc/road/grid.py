@@ -262,8 +262,9 @@ def occupancy_grid(
     top_view = perception.top_view
     usual = TopViewGeometry() if top_view is None else top_view.geometry
     usual = ALL_AROUND if knows_road(perception.points) else usual
+    x_m, y_m = usual.x_range_m if x_range_m is None else x_range_m, usual.y_range_m if y_range_m is None else y_range_m
     try:
-        view = TopViewGeometry(x_range_m or usual.x_range_m, y_range_m or usual.y_range_m, cell_m=cell_m)
+        view = TopViewGeometry(x_m, y_m, cell_m=cell_m)
     except (CardError, TypeError, ValueError) as exc:
         raise OptionError(
             f"got cell_m={cell_m!r}, x_range_m={x_range_m!r}, y_range_m={y_range_m!r}: no grid ({exc})"

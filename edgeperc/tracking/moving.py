@@ -128,7 +128,7 @@ def movable_points(
 
 
 def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
-    OPTIONS.number("margin_m", margin_m, 0.0)
+    margin_m = OPTIONS.number("margin_m", margin_m, 0.0)
     rows = [
         (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
         for box in boxes

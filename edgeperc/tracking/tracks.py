@@ -225,24 +225,6 @@ class Tracks(Sequence[Track]):
         that of the last scan.
     """
 
-    __slots__ = (
-        "T_world_sensor",
-        "_labels",
-        "_made",
-        "_rows",
-        "_world",
-        "boxes",
-        "fronts",
-        "ids",
-        "is_late",
-        "n_approximated",
-        "n_tentative",
-        "scores",
-        "session",
-        "sources",
-        "stamp_s",
-    )
-
     def __init__(
         self,
         rows: Records,

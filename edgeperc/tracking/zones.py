@@ -75,7 +75,7 @@ class Zone:
         """
         rows = read_only(by_axes(points, "xy")[:, :2], np.float64)
         inside = np.empty(len(rows), np.bool_)
-        mark_inside(self.polygon, rows, inside)
+        mark_inside(read_only(self.polygon, np.float64), rows, inside)  # a copy or a pickle may be written
         return inside
 
     def boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:

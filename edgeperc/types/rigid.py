@@ -1,15 +1,18 @@
-"""Numbers that callers pass, and rigid transforms: a rotation and a translation, up to rounding."""
+"""Numbers and times that callers pass, and rigid transforms: a rotation and a translation, up to rounding."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import EdgepercError
+from ..errors import EdgepercError, PointsError, StampError
+from ..system.clock import LATEST_S
+from .points import check_each
 
 # Of R R^T. KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
 ROTATION_TOLERANCE = 1e-3
 ROW_TOLERANCE = 1e-6  # of the last row: what is multiplied or inverted in float32 is as far off
+COARSEST_S = 0.002  # of times: 0.06 m at 30 m/s
 
 
 def numbers_of(what: str, given: ArrayLike, error: type[EdgepercError], expected: str) -> NDArray[np.float64]:
@@ -21,6 +24,23 @@ def numbers_of(what: str, given: ArrayLike, error: type[EdgepercError], expected
         return np.array(values, np.float64, order="C")
     except (OverflowError, RuntimeError, TypeError, ValueError) as exc:
         raise error(f"{what} ({exc}); expected {expected}") from exc
+
+
+def times_of(given: ArrayLike, n: int) -> NDArray[np.float64]:
+    """Times of n points [s], NaN for what is none; PointsError, or StampError of another unit or rounding."""
+    times = numbers_of("got times that are not numbers", given, PointsError, f"({n},) seconds")
+    check_each(n, times=times)
+    known = np.abs(times[np.isfinite(times)])
+    usual = np.float64(np.median(known) if len(known) else 0.0)
+    off_s = np.spacing(usual.astype(np.float32)) if getattr(given, "dtype", None) == np.float32 else 0.0
+    if usual > LATEST_S or off_s > COARSEST_S:
+        rounded = f", which float32 holds to {off_s:.2g} s" if off_s else ""
+        raise StampError(
+            f"got times of {usual:.6g} s{rounded}; expected float64 up to {LATEST_S:g}, or seconds since the start of "
+            "the scan"
+        )
+    times[~(np.abs(times) <= LATEST_S)] = np.nan
+    return times
 
 
 def rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:

@@ -53,8 +53,9 @@ class TopViewGeometry:
     kind = "top_view"
 
     def __post_init__(self) -> None:
-        check_bounds(self)
-        _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
+        for name, bounds in check_bounds(self).items():
+            object.__setattr__(self, name, bounds)
+        object.__setattr__(self, "cell_m", _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0))
         check_size(self.height, self.width)
 
     @property

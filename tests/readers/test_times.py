@@ -529,6 +529,9 @@ def test_gathering_begins_anew_after_a_step_back_of_the_clock() -> None:
     assert found == [[1.5, 2.0]]  # 1 s old is too old
     found = [points[:, 0].tolist() for _, points, _ in accumulate(map(scan, (8.0, 8.5, 8.75)), 5.0)]
     assert found == [[8.0, 8.5, 8.75]]  # shorter than the time: all at the end
+    damaged = TimedScan(8.0, np.full((3, 4), 8.0, np.float32), np.array([8.0, np.inf, -np.inf]))
+    found = [points[:, 0].tolist() for _, points, _ in accumulate([damaged, scan(8.5), scan(8.9375)], 1.0)]
+    assert found == [[8.0, 8.0, 8.0, 8.5, 8.9375]]
 
 
 def test_what_cannot_be_gathered() -> None:
@@ -546,6 +549,9 @@ def test_what_cannot_be_gathered() -> None:
     for motion in ((1.0, 0.0, 0.0), np.eye(4), "poses.txt"):
         with pytest.raises(OptionError, match=r"(?s)motion is .*expected a Motion, a Trajectory or None"):
             next(accumulate([scan], 0.5, motion))  # type: ignore[arg-type]
+    for unit, holds in ((1.7e18, "got times of 1.7e\\+18 s"), (np.float32(1.7e9), "float32 holds to 1.3e\\+02 s")):
+        with pytest.raises(StampError, match=f"{holds}.*expected float64"):  # of all scans, none is 0.1 s later
+            next(accumulate([TimedScan(None, np.ones((1, 4), np.float32), np.full(1, unit))] * 2, 0.1))
     with pytest.raises(StampError, match="expected poses around it"):
         next(accumulate([TimedScan(7.0, np.ones((3, 4), np.float32), None)], 0.5, true_trajectory()))
     assert list(accumulate([TimedScan(0.0, np.ones((2, 4), np.float32), np.full(2, np.nan))], 0.5)) == []

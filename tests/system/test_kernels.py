@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from checkout import REPOSITORY, printed
 from edgeperc.errors import MissingExtraError
+from edgeperc.ground import planes
 from edgeperc.system import kernels
 from edgeperc.system.kernel_stamp import code_of
 from edgeperc.system.kernels import Kernel, Library, kind_of, njit, written
+from edgeperc.tracking import zones
 
 
 class Pair(NamedTuple):
@@ -117,6 +119,20 @@ def test_a_compiled_form_is_called_for_its_types_only() -> None:
     values.setflags(write=False)
     assert kernel(values, 2) == 12.0
     assert len(module.called) == 1
+
+
+def test_results_of_another_process_need_no_other_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.pad(np.random.default_rng(0).uniform(-20.0, 20.0, (9999, 2)).astype(np.float32), ((0, 0), (0, 2)))
+    zone, ground = zones.Zone([(0, 0), (1, 0), (0, 1)]), planes.fit_ground(points - [[0, 0, 1.73, 0]]).surface()
+    kinds: list[object] = []
+    for module, name in ((zones, "mark_inside"), (planes, "fill_levels"), (planes, "fill_heights")):
+        monkeypatch.setattr(module, name, lambda *args: kinds.append([*map(kind_of, args)]))
+    for may_write in (True, False):  # as a pickle gives arrays, and as shared memory does
+        zone.polygon.flags.writeable = ground.planes.flags.writeable = may_write
+        zone.mark(points)
+        planes.heights_above(ground, points)
+    assert len(kinds) == 6
+    assert kinds[:3] == kinds[3:]
 
 
 def test_an_edited_kernel_is_not_the_compiled_one() -> None:
