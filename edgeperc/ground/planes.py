@@ -136,7 +136,7 @@ def heights_above(ground: GroundSurface | None, points: Points) -> Ground:
     lowest = np.where(own_lowest.reshape(-1) >= 0, np.int32(n + k), np.int32(-1))
     lowest[ground.cells] = np.arange(n, n + k, dtype=np.int32)
     rows = np.arange(n, dtype=np.int32)
-    every = np.concatenate([scan, ground.lowest, far_above])
+    every = read_only(np.concatenate([scan, ground.lowest, far_above]))  # of the type that a `Perceiver` compiled
     plane, found = np.array(ground.expected), ground.plane is not None
     return GroundFit(every, cell, lowest.reshape(N_CELLS, N_CELLS), plane, ground.planes, found).heights(rows)
 

@@ -131,8 +131,7 @@ def test_results_of_another_process_need_no_other_form(monkeypatch: pytest.Monke
         zone.polygon.flags.writeable = ground.planes.flags.writeable = may_write
         zone.mark(points)
         planes.heights_above(ground, points)
-    assert len(kinds) == 6
-    assert kinds[:3] == kinds[3:]
+    assert (len(kinds), kinds[:3]) == (6, kinds[3:])
 
 
 def test_an_edited_kernel_is_not_the_compiled_one() -> None:

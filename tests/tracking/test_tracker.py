@@ -309,9 +309,7 @@ def test_tracks_name_their_detections() -> None:
     boxes = [box("car", 30.0, 9.0, score=0.99), box("car", 10.0, 0.0, score=0.99)]
     tracker.update(boxes, 0.0, STANDING)
     assert tracker.update(boxes[::-1], 0.1, STANDING).sources.tolist() == [1, 0]
-    tracks = tracker.update(boxes[:1], 0.2, STANDING)
-    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
-        assert pickle.loads(pickle.dumps(tracks, protocol)).sources.tolist() == tracks.sources.tolist() == [0, -1]
+    assert pickle.loads(pickle.dumps(tracker.update(boxes[:1], 0.2, STANDING), 0)).sources.tolist() == [0, -1]
 
 
 def test_far_tracks_score_higher_and_coasting_ones_lower_if_the_class_says_so() -> None:
