@@ -34,8 +34,8 @@ FLOORS = {
         system.compiling system.kernel_stamp
         system.kernel_cache
         system.kernels
-        system.compilation system.draws
-        types.points types.rigid
+        system.compilation system.draws types.points
+        types.rigid
         types.__init__ types.choices types.mounting types.onnx_file types.views
         types.detector
         types.card types.sensor
