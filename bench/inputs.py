@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc import Box, PointsError, read_points
+from edgeperc import Box, PointsError, SensorError, read_points
 from edgeperc.cli.scans import sensor_in
 from edgeperc.preprocess.sensor_estimate import MOST_SCANS, has_enough_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
@@ -59,12 +59,21 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input,
             raise PointsError(f"{path} holds no scan; expected files that end in {', '.join(SCAN_SUFFIXES)}")
         files += found
     scans = [np.ascontiguousarray(read_points(file)) for file in files]
-    enough = [scan for scan in scans if has_enough_points(scan)][:MOST_SCANS]
+    by_folder: dict[Path, list[Floats32]] = {}  # `edgeperc run` finds the sensor of each folder
+    for file, scan in zip(files, scans, strict=True):
+        if sensor == AUTO_SENSOR and has_enough_points(scan):
+            by_folder.setdefault(file.parent, []).append(scan)
     source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
-    name = sensor = DEFAULT_SENSOR if sensor == AUTO_SENSOR and not enough else sensor  # as `edgeperc run` takes it
+    name = sensor = DEFAULT_SENSOR if sensor == AUTO_SENSOR and not by_folder else sensor  # as `edgeperc run` takes it
     if sensor == AUTO_SENSOR:
-        estimate = sensor_in(enough)
-        estimate.tell_doubt("warn")
+        found = {where: sensor_in(some[:MOST_SCANS]) for where, some in by_folder.items()}
+        sure = {where: each for where, each in found.items() if not each.doubt}
+        if len({each.profile.name for each in sure.values()}) > 1:
+            names = ", ".join(f"{where} of {each.profile.name}" for where, each in sure.items())
+            raise SensorError(f"the scans are of several sensors: {names}; measure those of each on their own")
+        for where, estimate in found.items():
+            estimate.tell_doubt("warn", f"{where}: ")
+        estimate = next(iter((sure or found).values()))
         name = sensor = estimate.profile.name
         if estimate.profile not in SENSORS.values():
             sensor = str(folder / f"{name}.json")

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TextIO
 
+from edgeperc.cli.output import print_line
 from edgeperc.system.printable import printable
 
 from .samples import summary
@@ -139,8 +140,7 @@ class LiveTable:
     def note(self, line: str) -> None:
         """Print a line that stays."""
         self.clear()
-        self.stream.write(f"edgeperc-bench: {printable(line)}\n")
-        self.stream.flush()
+        print_line(f"edgeperc-bench: {line}", self.stream)
 
     def clear(self) -> None:
         """Erase the table."""

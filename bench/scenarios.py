@@ -53,7 +53,7 @@ class Timings:
     ms: list[float] = field(default_factory=list)  # from scan to result
     # from the arrival of the scan; ``ms`` if scans do not arrive at a rate
     age_ms: list[float] = field(default_factory=list)
-    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # as `edgeperc.Perception.stage_ms`
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # 0 for a scan without this stage
     warm_up_ms: list[float] = field(default_factory=list)
     missed: int = 0  # results that were not complete when the next scan arrived
     skipped: int = 0  # scans that a newer one overtook; they have no sample
@@ -63,11 +63,11 @@ class Timings:
         self.n += 1
         if (self.n - 1) % self.stride:
             return
+        for stage in {**self.stage_ms, **stage_ms}:  # some scans need no adaptation
+            self.stage_ms.setdefault(stage, [0.0] * len(self.ms)).append(stage_ms.get(stage, 0.0))
         self.start_s.append(start_s)
         self.ms.append(ms)
         self.age_ms.append(age_ms)
-        for stage, took in stage_ms.items():
-            self.stage_ms.setdefault(stage, []).append(took)
 
 
 KeepGoing = Callable[[Timings], bool]

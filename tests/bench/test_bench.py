@@ -25,7 +25,7 @@ import pytest
 import scenes
 from cli_helpers import Shell, parsers
 from edgeperc import Perceiver
-from edgeperc.errors import ModelFileError, PointsError, ProviderError
+from edgeperc.errors import ModelFileError, PointsError, ProviderError, SensorError
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc.system import machine
@@ -401,10 +401,13 @@ def test_scans_are_sized_and_crowded_in_the_sensors_own_unit(tmp_path: Path) -> 
 
 def test_the_sensor_of_ones_own_scans_is_found_in_their_points(tmp_path: Path) -> None:
     """As HDL-64E's, which they were all taken for, their remission and beams would be others."""
-    (tmp_path / "scans").mkdir()
-    inputs.simulated_input(tmp_path / "scans", 1, "vlp-16")
-    scans, sensor = inputs.read_input(tmp_path, [tmp_path / "scans"], "auto")
+    for name in ("vlp-16", "os1-64"):
+        (tmp_path / name).mkdir()
+        inputs.simulated_input(tmp_path / name, 1, name)
+    scans, sensor = inputs.read_input(tmp_path, [tmp_path / "vlp-16"], "auto")
     assert (scans.record["sensor"], inputs.get_sensor(sensor).n_beams) == ("vlp-16", 16)
+    with pytest.raises(SensorError, match=r"several sensors: .*vlp-16 of vlp-16, .*os1-64 of os1-64; measure those"):
+        inputs.read_input(tmp_path, [tmp_path / "vlp-16", tmp_path / "os1-64"], "auto")
     assert cli.build_parser().parse_args(["run"]).sensor == "auto"
 
 

@@ -132,7 +132,8 @@ class FakePerceiver:
     def __call__(self, scan: Any) -> Any:
         self.clock.time_s += self.takes_s[len(self.seen) % len(self.takes_s)]
         self.seen.append(scan)
-        return SimpleNamespace(stage_ms={"infer": 1.0})
+        adapted = {"adapt": 2.0} if len(self.seen) % 4 == 0 else {}
+        return SimpleNamespace(stage_ms={"infer": 1.0} | adapted)
 
 
 def timed(
@@ -152,7 +153,7 @@ def test_back_to_back_wants_both_scans_and_seconds() -> None:
     assert samples.ms == samples.age_ms == pytest.approx([500.0] * 8)
     assert samples.start_s == pytest.approx([0.5 * k for k in range(8)])
     assert samples.first_s == pytest.approx(101.0)
-    assert samples.stage_ms == {"infer": [1.0] * 8}
+    assert samples.stage_ms == {"infer": [1.0] * 8, "adapt": [0.0, 2.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0]}
     assert len(timed([0.5], ["a"], Limits(9, 0.0, 0))[0].ms) == 9
 
 
