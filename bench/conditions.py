@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeperc import Perceiver
+from edgeperc import Perceiver, PointsError
+from edgeperc.cli.arguments import positive
+from edgeperc.cli.program import run_program
 from edgeperc.datasets.kitti import read_drives
 from edgeperc.preprocess.condition import condition
 from edgeperc.preprocess.health import NORMAL_SCANS, Normal, check_health, without_drops
@@ -55,6 +57,8 @@ def kitti(folder: Path, n: int) -> list[Scan]:
     """Scans of KITTI, evenly over the files that are full turns."""
     files = sorted((folder / "training" / "velodyne").glob("*.bin"))
     whole = [path for path in files if (np.fromfile(path, np.float32)[::4] < 0.0).any()]
+    if not whole:
+        raise PointsError(f"{folder} holds no scan of a full turn; expected .bin files in its training/velodyne")
     return [read_points(path) for path in whole[:: max(1, len(whole) // n)][:n]]
 
 
@@ -114,7 +118,8 @@ def print_answers(name: str, scans: Sequence[Scan], sensor: SensorProfile) -> No
 
 def print_clean(folder: Path, sensor: SensorProfile) -> None:
     """How many scans of clear air are warned of, each as the first one and as one of its drive."""
-    files = sorted(folder.glob("*.bin"))
+    if not (files := sorted(folder.glob("*.bin"))):
+        raise PointsError(f"{folder} holds no scan; expected .bin files")
     tables = [table for above in (folder.parent, folder.parent.parent) for table in sorted(above.glob("frames*.csv"))]
     drives = {row["name"]: row["drive"] for table in tables for row in read_drives(table)}
     first, later, normals = [], [], dict[str, Normal]()
@@ -133,7 +138,7 @@ def _row(kind: str, strength: float, unit: str, cells: Iterable[str]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", 1)[0])
     parser.add_argument("kitti", type=Path, nargs="?")
-    parser.add_argument("--scans", type=int, default=40)
+    parser.add_argument("--scans", type=positive, default=40)
     parser.add_argument("--clean", nargs=2, action="append", default=[], metavar=("FOLDER", "SENSOR"))
     arguments = parser.parse_args()
     if arguments.clean:
@@ -152,4 +157,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(run_program("edgeperc_bench.conditions", main))

@@ -17,6 +17,8 @@ from itertools import product
 import numpy as np
 
 from edgeperc import Mounting, Perceiver
+from edgeperc.cli.arguments import positive
+from edgeperc.cli.program import run_program
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.preprocess.findings import Finding
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, Scene, SimulatedScan, random_scene, simulate
@@ -139,7 +141,7 @@ def rows_of(name: str, height_m: float, place: str, n_scans: int) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser("edgeperc_bench.robots", description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("--scans", type=int, default=12, metavar="N", help="streets (default: 12)")
+    parser.add_argument("--scans", type=positive, default=12, metavar="N", help="streets (default: 12)")
     parser.add_argument("--sensors", nargs="+", default=[*SENSORS], metavar="NAME")
     parser.add_argument("--heights", nargs="+", type=float, default=[*HEIGHTS_M], metavar="M")
     parser.add_argument("--places", nargs="+", default=["road"], choices=PLACES)
@@ -152,4 +154,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(run_program("edgeperc_bench.robots", main))

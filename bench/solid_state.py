@@ -16,6 +16,8 @@ from functools import partial
 import numpy as np
 
 from edgeperc import Mounting, Perceiver, TimedScan, Trajectory, accumulate, merge
+from edgeperc.cli.arguments import positive
+from edgeperc.cli.program import run_program
 from edgeperc.evaluation.metrics import BoxEvaluator
 from edgeperc.simulation import SimulatedScan, random_scene, simulate, simulate_sequence
 from edgeperc.simulation.samples import FIRST_SEED
@@ -130,10 +132,10 @@ def time_turn(name: str, n_turns: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser("edgeperc_bench.solid_state", description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("--scans", type=int, default=24, metavar="N", help="streets (default: 24)")
+    parser.add_argument("--scans", type=positive, default=24, metavar="N", help="streets (default: 24)")
     parser.add_argument("--sensors", nargs="*", default=["mid-360", "mid-360-hanging"], metavar="NAME")
     parser.add_argument("--turn", nargs="*", metavar="NAME", help="only time four of these sensors as one turn")
-    parser.add_argument("--turns", type=int, default=40, metavar="N", help="scans that are timed (default: 40)")
+    parser.add_argument("--turns", type=positive, default=40, metavar="N", help="scans that are timed (default: 40)")
     given = parser.parse_args(arguments)
     if given.turn is not None:
         print("| four | points | merged, ms | one of the kind, ms | one HDL-64E, ms | ratios |")
@@ -150,4 +152,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(run_program("edgeperc_bench.solid_state", main))

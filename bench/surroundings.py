@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from edgeperc import Perceiver, occupancy_grid
+from edgeperc.cli.program import run_program
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.datasets.splits import names_of
 from edgeperc.evaluation.metrics import Confusion
@@ -24,6 +25,8 @@ from edgeperc.types.choices import DEFAULT_SENSOR
 from edgeperc.types.points import Bytes, Points
 from edgeperc.types.sensor import SensorProfile, get_sensor
 from edgeperc.types.views import TopViewGeometry
+
+from .render import number
 
 VIEW = TopViewGeometry(ALL_AROUND.x_range_m, ALL_AROUND.y_range_m, cell_m=0.2)
 EXTENT: dict[str, Any] = {"x_range_m": VIEW.x_range_m, "y_range_m": VIEW.y_range_m, "cell_m": VIEW.cell_m}
@@ -66,14 +69,14 @@ def print_set(name: str, sensor: SensorProfile, scans: list[tuple[Points, Bytes]
                 counted = where & grid.observed & (cells != IGNORE)
                 confusions[place].update(grid.drivable[counted], cells[counted] == 1)
         for place, of in confusions.items():
-            shares = np.nan_to_num([each[1] for each in (of.precision(), of.recall(), of.iou())])
-            print(f"| {name} | {models} | {place} | " + " | ".join(f"{100.0 * share:.1f}" for share in shares) + " |")
+            shares = (number(100.0 * each[1], 1) for each in (of.precision(), of.recall(), of.iou()))
+            print(f"| {name} | {models} | {place} | " + " | ".join(shares) + " |")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", 1)[0])
-    parser.add_argument("sets", nargs="*", type=ScanFolder.parse, metavar="SET")
-    sets = parser.parse_args().sets
+    parser.add_argument("sets", nargs="*", metavar="SET")
+    sets = [*map(ScanFolder.parse, parser.parse_args().sets)]
     print("| set | road by | where | precision | recall | IoU |\n|---|---|---|---|---|---|")
     if not sets:
         print_set(f"{N_STREETS} simulated streets", get_sensor(DEFAULT_SENSOR), [*streets()])
@@ -83,4 +86,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(run_program("edgeperc_bench.surroundings", main))

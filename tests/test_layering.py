@@ -161,9 +161,9 @@ FLOORS = {
         __init__
     """,
     "edgeperc_bench": """
-        application conditions context inputs options samples scenarios surroundings
+        application conditions context inputs options samples scenarios
         document loadgen render start
-        plots report worker
+        plots report surroundings worker
         accuracy
         measure robots solid_state
         peers.__init__ peers.arithmetic peers.networks peers.rounds

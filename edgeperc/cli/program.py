@@ -60,7 +60,7 @@ class _TerminatedError(SystemExit):
     """SIGTERM or SIGHUP arrived. Like `KeyboardInterrupt` it runs every ``finally``: files and processes are closed."""
 
 
-def run_program(program: str, command: Callable[[], int], message: Callable[[Exception], str] = str) -> int:
+def run_program(program: str, command: Callable[[], int | None], message: Callable[[Exception], str] = str) -> int:
     """Run a program's command line, its warnings and errors (as ``message`` says them) one line each on stderr; 2 after
     an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP, 141 in silence if what reads
     it closed it.
@@ -75,7 +75,7 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
             with _signals_raise(raised), warnings.catch_warnings():
                 warnings.showwarning = partial(show_warning, program=program)
                 try:
-                    code = command()
+                    code = command() or 0
                 finally:
                     sys.stdout.flush()
         except BaseException as exc:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import time
 import warnings
@@ -113,9 +114,9 @@ def add_parser(commands: Commands) -> None:
     )
     reading(
         "--calib FILE",
-        "KITTI's calibration of camera and LiDAR: a file for all images, or a folder with NAME.txt of each scan; with "
-        "--scan and --png, NAME_both.png shows the classes of the image on the points, and its road from above "
-        "(default: no such picture)",
+        "KITTI's calibration of LiDAR and left color camera: a file for all images, or a folder with NAME.txt of each "
+        "scan; with --scan and --png, NAME_both.png shows the classes of the image on the points, and its road from "
+        "above (default: no such picture)",
     )
     add_capture(reading)
     reading(
@@ -329,6 +330,10 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         if not (images and scans and arguments.png):
             arguments.usage_error("--calib needs images with --scan and --png")
         read_kitti_calibration(calibration_of(arguments.calib, scans[0].name))  # errors come before the first image
+    for image in images if arguments.calib is not None else ():
+        if re.search(r"/image_0?[013]/(data/)?[^/]+$", image.absolute().as_posix()):
+            what = f"left color camera, and {image} is of another one by its folder; pass images of image_2 or image_02"
+            arguments.usage_error(f"--calib is for KITTI's {what}, or paint those of others in Python")
     if not images:
         return {}
     if arguments.live or arguments.deskew:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -43,3 +45,11 @@ def test_a_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         [f" 0.5 m, {place} ", f" {word} "] for place in ("road", "box-given") for word in ("given", "found")
     ]
     assert all("1 of 1" in row for row in rows)
+
+
+def test_programs_say_what_is_wrong() -> None:
+    wrong = {"robots --sensors nosuch": "no sensor 'nosuch'", "surroundings .:nosuch": "no layout 'nosuch'"}
+    for typed, said in (wrong | {"conditions --clean . vlp-16": ". holds no scan"}).items():
+        command = f"{sys.executable} -m edgeperc_bench.{typed}".split()
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr.startswith(f"edgeperc_bench.{typed.split()[0]}: {said}")) == (2, True)

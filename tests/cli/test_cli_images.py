@@ -102,7 +102,7 @@ def test_times_in_names_tell_that_a_pair_is_none() -> None:
         check_pairs(argparse.Namespace(), images[:4], scans[1:])
 
 
-def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path) -> None:
+def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path, shell: Shell) -> None:
     pytest.importorskip("matplotlib")
     image, scan = write_image(tmp_path / "a.png"), write_scan(tmp_path / "0.bin", 4000)
     (tmp_path / "calib").mkdir()
@@ -116,6 +116,9 @@ def test_each_image_may_have_its_calibration(tmp_path: Path, model: Path) -> Non
         assert run("run", image, "--scan", scan, *options, *wanted, "--labels-for", kind) == 0
     assert (out / "a_both.png").exists()
     assert (out / "calib/0.txt").read_text() == calibration
+    other = write_image(tmp_path / "image_00/data/a.png")
+    said = shell.err("run", other, "--scan", scan, *options, *wanted, code=2)
+    assert f"left color camera, and {other} is of another one" in said
 
 
 def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, shell: Shell) -> None:
