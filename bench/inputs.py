@@ -66,14 +66,14 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input,
     source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
     name = sensor = DEFAULT_SENSOR if sensor == AUTO_SENSOR and not by_folder else sensor  # as `edgeperc run` takes it
     if sensor == AUTO_SENSOR:
-        found = {where: sensor_in(some[:MOST_SCANS]) for where, some in by_folder.items()}
-        sure = {where: each for where, each in found.items() if not each.doubt}
+        seen = {where: sensor_in(some[:MOST_SCANS]) for where, some in by_folder.items()}
+        sure = {where: each for where, each in seen.items() if not each.doubt}
         if len({each.profile.name for each in sure.values()}) > 1:
             names = ", ".join(f"{where} of {each.profile.name}" for where, each in sure.items())
             raise SensorError(f"the scans are of several sensors: {names}; measure those of each on their own")
-        for where, estimate in found.items():
+        for where, estimate in seen.items():
             estimate.tell_doubt("warn", f"{where}: ")
-        estimate = next(iter((sure or found).values()))
+        estimate = next(iter((sure or seen).values()))
         name = sensor = estimate.profile.name
         if estimate.profile not in SENSORS.values():
             sensor = str(folder / f"{name}.json")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edgeperc.cli.arguments import Options, count, options, positive
+from edgeperc.cli.arguments import Options, count, finite_number, options, positive
 from edgeperc.cli.output import in_options
 from edgeperc.errors import ProviderError
 from edgeperc.inference.providers import PROVIDERS, check_names
@@ -68,25 +68,13 @@ def add_command(
 
 def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -> None:
     """``--min-scans``, ``--min-seconds``, ``--warm-up`` and ``--repeats`` with a command's own defaults."""
-    add(
-        "--min-scans N",
-        "measure at least this many scans in each scenario (default: %(default)s)",
-        type=positive,
-        default=min_scans,
-    )
-    add(
-        "--min-seconds S",
-        "measure each scenario for at least this long (default: %(default)s)",
-        type=seconds,
-        default=min_seconds,
-    )
+    least = "measure at least this many scans in each scenario (default: %(default)s)"
+    add("--min-scans N", least, type=positive, default=min_scans)
+    span = "measure each scenario for at least this long (default: %(default)s)"
+    add("--min-seconds S", span, type=seconds, default=min_seconds)
     add("--warm-up N", "scans before the first one that counts (default: %(default)s)", type=count, default=20)
-    add(
-        "--repeats N",
-        "repeat the measurement in this many fresh processes; their spread is the noise (default: %(default)s)",
-        type=positive,
-        default=repeats,
-    )
+    again = "repeat the measurement in this many fresh processes; their spread is the noise (default: %(default)s)"
+    add("--repeats N", again, type=positive, default=repeats)
 
 
 # Types of values
@@ -94,11 +82,7 @@ def add_limits(add: Options, min_scans: int, min_seconds: float, repeats: int) -
 
 def seconds(text: str) -> float:
     """The type of a duration."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < math.inf:
+    if (value := finite_number(text)) < 0.0:
         raise argparse.ArgumentTypeError(f"got {text!r}; expected seconds")
     return value
 

@@ -69,14 +69,12 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             f"from scan to result in ms; {n} repeat{'s' * (n != 1)}, each in a fresh process; a dash: too few samples "
             "for this percentile; noise: spread of the repeats' medians"
         ]
-        for name, t in figures.items():
-            if t["energy_j_per_scan"]:
-                rails = ", ".join(f"{rail} {joules:.3f} J" for rail, joules in t["energy_j_per_scan"].items())
-                sentences.append(
-                    f"energy of a scan, {name}, of the whole package or board with everything that ran on it: {rails}"
-                )
-        if all(not t["energy_j_per_scan"] for t in figures.values()):
-            sentences.append("energy: this machine has no counter that can be read")
+        used = {name: t["energy_j_per_scan"] for name, t in figures.items() if t["energy_j_per_scan"]}
+        for name, joules in used.items():
+            rails = ", ".join(f"{rail} {each:.3f} J" for rail, each in joules.items())
+            what = "of the whole package or board with everything that ran on it"
+            sentences.append(f"energy of a scan, {name}, {what}: {rails}")
+        sentences += [] if used else ["energy: this machine has no counter that can be read"]
         parts.append(Section("Latency", sentences, [head, *rows]))
     paces = {name: t for name, t in figures.items() if t["rate_hz"]}
     if paces:

@@ -44,12 +44,8 @@ def add_parser(subparsers: Any) -> None:
     ):
         text = f"{what} with commas between them, or all; one of {', '.join(known)} (default: all)"
         add(option, text, type=choices(known), default=list(known))
-    add(
-        "--threads 1,2,4",
-        "numbers of threads with commas between them (default: 1 and the number of cores that may be used)",
-        type=numbers(1),
-        default=list(dict.fromkeys([1, usable_cores()])),
-    )
+    threads = "numbers of threads with commas between them (default: 1 and the number of cores that may be used)"
+    add("--threads 1,2,4", threads, type=numbers(1), default=list(dict.fromkeys([1, usable_cores()])))
     add(
         "--recommend FILE",
         "save the recommendation to FILE; without FILE, to settings.json in the folder EDGEPERC_CACHE_DIR, by "

@@ -23,12 +23,8 @@ def add_parser(subparsers: Any) -> None:
         "Then measure networks and methods of others beside edgeperc's whole answers. "
         "What is not installed is listed and left out.",
     )
-    add(
-        "--rounds N",
-        "how often each contender takes its turn with all scans (default: %(default)s)",
-        type=positive,
-        default=25,
-    )
+    turns = "how often each contender takes its turn with all scans (default: %(default)s)"
+    add("--rounds N", turns, type=positive, default=25)
     add(
         "--tables LIST",
         "engines: the models elsewhere; methods: SalsaNext, SqueezeSegV2, FIDNet, CENet, PointPillars, SFA3D and "

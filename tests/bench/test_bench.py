@@ -215,7 +215,7 @@ def test_the_verdict_is_one_sentence(
     assert report.verdict(setting) == ""
 
 
-def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
+def test_a_live_table_replaces_itself_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
     live, file = LiveTable(scenes.Terminal()), LiveTable(io.StringIO())
     for table in (live, file):
         table("single-stream", [3.0] * 30)
@@ -225,6 +225,9 @@ def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
     assert "\x1b[2A\x1b[J" in shown  # the head and one row are taken away before the next line
     assert file.stream.getvalue() == "edgeperc-bench: next\n"
     assert file.ms == {"single-stream": [3.0] * 30}
+    full = Mock(isatty=lambda: False, write=Mock(side_effect=OSError("no space left")))
+    monkeypatch.setattr("sys.stderr", full)
+    LiveTable().note("next")  # where nobody can be told, the measurement goes on
 
 
 # the command
@@ -401,13 +404,13 @@ def test_scans_are_sized_and_crowded_in_the_sensors_own_unit(tmp_path: Path) -> 
 
 def test_the_sensor_of_ones_own_scans_is_found_in_their_points(tmp_path: Path) -> None:
     """As HDL-64E's, which they were all taken for, their remission and beams would be others."""
-    for name in ("vlp-16", "os1-64"):
-        (tmp_path / name).mkdir()
-        inputs.simulated_input(tmp_path / name, 1, name)
-    scans, sensor = inputs.read_input(tmp_path, [tmp_path / "vlp-16"], "auto")
+    for folder in (folders := [tmp_path / "vlp-16", tmp_path / "os1-64"]):
+        folder.mkdir()
+        inputs.simulated_input(folder, 1, folder.name)
+    scans, sensor = inputs.read_input(tmp_path, folders[:1], "auto")
     assert (scans.record["sensor"], inputs.get_sensor(sensor).n_beams) == ("vlp-16", 16)
     with pytest.raises(SensorError, match=r"several sensors: .*vlp-16 of vlp-16, .*os1-64 of os1-64; measure those"):
-        inputs.read_input(tmp_path, [tmp_path / "vlp-16", tmp_path / "os1-64"], "auto")
+        inputs.read_input(tmp_path, folders, "auto")
     assert cli.build_parser().parse_args(["run"]).sensor == "auto"
 
 

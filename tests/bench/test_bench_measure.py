@@ -132,8 +132,7 @@ class FakePerceiver:
     def __call__(self, scan: Any) -> Any:
         self.clock.time_s += self.takes_s[len(self.seen) % len(self.takes_s)]
         self.seen.append(scan)
-        adapted = {"adapt": 2.0} if len(self.seen) % 4 == 0 else {}
-        return SimpleNamespace(stage_ms={"infer": 1.0} | adapted)
+        return SimpleNamespace(stage_ms={"infer": 1.0} | ({"adapt": 2.0} if len(self.seen) % 4 == 0 else {}))
 
 
 def timed(
