@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
+from ..system.remote import location
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Floats32, Mask, as_points
 from .run_file import ScanFiles, stem_of
@@ -24,10 +25,10 @@ class StaticSink:
     """Writes each scan without its points on moving, or on movable, objects.
 
     A file has the name and the format of the scan's file: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply`` with x, y,
-    z and remission of the remaining points, in their order; ``.pcd.bin`` with the ring, too. Scans of captures and
-    bags become ``NUMBER.bin``, float32 x, y, z, remission. Points whose place in a map is known (``origin_m``) stay in
-    the map, as doubles; those of ``.bin`` are float32. A file that is there stays, if it differs: it may be the scan of
-    another drive.
+    z and remission of the remaining points, in their order; ``.pcd.bin`` with all its values, such as the ring.
+    Scans of captures and bags become ``NUMBER.bin``, float32 x, y, z, remission. Points whose place in a map is known
+    (``origin_m``) stay there, as doubles; those of ``.bin`` are float32. A file that is there and differs stays: it may
+    be the scan of another drive.
 
     Parameters
     ----------
@@ -90,20 +91,16 @@ def file_name(scan: str) -> str:
 def _content(xyz: NDArray[Any], remission: Floats32, kept: Mask, source: str) -> bytes:
     """The file of the points that are kept; their coordinates have the type of ``xyz``."""
     suffix = stem_of(source)[1]
-    if suffix == ".pcd.bin":
-        whole = np.fromfile(source, "<f4")
-        if whole.size != 5 * len(xyz):
-            raise PointsError(
-                f"{source} holds {whole.size} values for a scan of {len(xyz):,} points; expected 5 for each point"
-            )
-        return whole.reshape(-1, 5)[kept].tobytes()
-    rows = np.column_stack([xyz[kept], remission[kept]])
+    rows = np.column_stack([xyz, remission])
+    if suffix == ".pcd.bin":  # a scan that was straightened has other coordinates than its file
+        whole = np.frombuffer(location(source).read_bytes(), np.uint8)
+        if whole.size % (4 * len(xyz) or np.inf):
+            raise PointsError(f"{source} holds {whole.size:,} bytes for {len(xyz):,} points; expected as many for each")
+        rows = np.column_stack([xyz, whole.view("<f4").reshape(len(xyz), -1)[:, 3:]])
+    rows = rows[kept]
     if suffix in (".npy", ".npz"):
         file = io.BytesIO()
-        if suffix == ".npy":
-            np.save(file, rows)
-        else:
-            np.savez(file, points=rows)
+        np.save(file, rows) if suffix == ".npy" else np.savez(file, points=rows)
         return file.getvalue()
     if suffix not in (".pcd", ".ply"):
         return rows.astype("<f4").tobytes()

@@ -20,6 +20,7 @@ from edgeperc.cli.main import build_parser
 from edgeperc.cli.sinks import Sinks
 from edgeperc.records import PerceivedScan
 from edgeperc.sinks.static import StaticSink
+from edgeperc.system.remote import location
 from edgeperc.types.sensor import get_sensor
 
 AHEAD = Box("car", 0.99, (12.0, 0.0, -0.9), (4.0, 1.8, 1.5), 0.0)
@@ -108,17 +109,21 @@ def test_of_a_scan_that_came_twice_what_could_move_goes(tmp_path: Path) -> None:
     assert (tmp_path / "moving" / "x.bin").read_bytes() == (tmp_path / "movable" / "x.bin").read_bytes()
 
 
-def test_the_ring_of_nuscenes_files_stays(tmp_path: Path) -> None:
-    source = tmp_path / "sweep.pcd.bin"
-    rings = np.arange(len(POINTS), dtype=np.float32)
-    np.column_stack([POINTS, rings]).astype(np.float32).tofile(source)
+@pytest.mark.parametrize("values", [4, 5, 6])
+@pytest.mark.parametrize("url", ["", "memory:/"])
+def test_the_ring_of_nuscenes_files_stays(tmp_path: Path, url: str, values: int) -> None:
+    """With the coordinates of the scan, which has been straightened."""
+    source, rings = location(f"{url}{tmp_path}/sweep.pcd.bin"), np.arange(len(POINTS), dtype=np.float32)
+    columns = np.column_stack([POINTS + np.float32([0.5, 0.0, 0.0, 0.0]), rings, rings])[:, :values]
+    source.write_bytes(columns.tobytes())
     sink = StaticSink(tmp_path / "out")
     sink.write(perceived(str(source)))
-    rows = np.fromfile(tmp_path / "out/sweep.pcd.bin", np.float32).reshape(-1, 5)
+    rows = np.fromfile(tmp_path / "out/sweep.pcd.bin", np.float32).reshape(-1, values)
     np.testing.assert_array_equal(rows[:, :4], expected(AHEAD))
-    np.testing.assert_array_equal(POINTS[rows[:, 4].astype(int)], rows[:, :4])
+    if values > 4:
+        np.testing.assert_array_equal(POINTS[rows[:, 4].astype(int)], rows[:, :4])
     source.write_bytes(source.read_bytes()[:-20])
-    with pytest.raises(PointsError, match="expected 5 for each point"):
+    with pytest.raises(PointsError, match="expected as many for each"):
         sink.write(perceived(str(source)))
 
 
