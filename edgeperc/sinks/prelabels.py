@@ -49,8 +49,9 @@ class PrelabelSink:
 
     With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
     the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
-    place there is known (``origin_m``); KITTI's are in the frame of the camera. A scan without boxes gets an empty
-    file. Labels that differ from those in the folder do not replace them: they may be corrected, or the truth.
+    place there is known (``origin_m``); KITTI's are in the frame of the camera, where ``calib/NAME.txt`` puts
+    the file's points. A scan without boxes gets an empty file. Labels that are there and differ stay: they may be
+    corrected, or the truth.
 
     - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
@@ -202,10 +203,13 @@ class PrelabelSink:
             size = size if image is None else (image.labels.shape[1], image.labels.shape[0])
             warn_off_center(P2, *size, "2-D boxes are cut to it. Pass the scans as --scan of their images")
             text = path.read_text("utf-8") if path.is_file() else ""
-        if not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
-            rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_sensor[:3]}
+        origin, T_cam_file = scan.perception.origin_m, T_cam_sensor.copy()
+        T_cam_file[:3, 3] -= T_cam_sensor[:3, :3] @ (origin or (0.0, 0.0, 0.0))
+        if origin or not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
+            rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_file[:3]}
             rows["Tr_imu_to_velo"] = np.eye(4)[:3]
-            text = "".join(f"{key}: {' '.join(f'{v:.6e}' for v in row.ravel())}\n" for key, row in rows.items())
+            form = f"{{:.{12 if origin else 6}e}}".format  # a map has millions of meters
+            text = "".join(f"{key}: {' '.join(map(form, row.flat))}\n" for key, row in rows.items())
         lines = [_kitti_line(box, T_cam_sensor, P2, size) for box, _ in boxes]
         self._write(f"calib/{name}.txt", scan.name, text.encode())  # first: labels are nothing without their camera
         self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
@@ -224,10 +228,8 @@ def _known_classes(path: Path) -> dict[str, dict[str, Any]]:
     """The classes of labels that are there, by name, if they have the form of those to write. Raises OptionError."""
     try:
         document = json.loads(path.read_text("utf-8-sig"))
-        form, classes = (
-            document["format"],
-            {each["name"]: {**each, "id": int(each["id"])} for each in document["classes"]},
-        )
+        form = document["format"]
+        classes = {each["name"]: {**each, "id": int(each["id"])} for each in document["classes"]}
     except (KeyError, TypeError, ValueError) as exc:
         raise OptionError(f"{path} holds no classes of labelCloud ({exc!r:.99}); choose another folder") from exc
     if form != _FORM:
