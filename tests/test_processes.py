@@ -359,6 +359,7 @@ def check_failed(code: int, printed: tuple[str, str], out: Path, reason: str) ->
     """Each scan has its error, on one line, the same reason once, and no part of a file is left."""
     records, errors = printed
     assert code == 1, errors
+    assert f"{reason}: '{out}/" in errors
     assert "Traceback" not in errors
     assert [reason in json.loads(line)["error"] for line in records.splitlines()] == [True, True]
     first, second = (line for line in errors.splitlines() if ".bin" in line)

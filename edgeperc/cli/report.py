@@ -60,7 +60,8 @@ class Report:
         if error is not None:
             self.n_failed += 1
             said = in_options(error)
-            first = self._reported.setdefault(re.sub(r"[-+\d.]+", "", said), source)  # whatever the numbers
+            alike = said.replace(source.name.partition(".")[0], "")  # whatever the scan and the numbers
+            first = self._reported.setdefault(re.sub(r"[-+\d.]+", "", alike), source)
             print_error(f"{source}: {said}" if first is source else f"{source}: the same as {first}")
 
     def text(

@@ -39,9 +39,6 @@ class PageSink:
     def close(self, whole: bool = True) -> None:
         """Write the page; without scans, none is written. See `Sink.close`. After an OSError, nothing of it is left."""
         if len(self._page):
-            try:
-                self._page.write(self._path if whole else part_of(self._path))
-            except OSError as exc:
-                raise OSError(exc.errno, exc.strerror, str(self._path)) from exc
+            self._page.write(self._path if whole else part_of(self._path))
             if not whole:
                 warn_of(part_of(self._path), self._path)

@@ -15,8 +15,8 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
     A link is followed. A target that is not a regular file, such as ``/dev/stdout`` or a named pipe, is written
-    directly. What was written is on the disk before it has its name. ``permissions`` of a new file are reduced by the
-    umask.
+    directly. What was written is on the disk before it has its name; an `OSError` has the target's. ``permissions`` of
+    a new file are reduced by the umask.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
@@ -34,6 +34,10 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as exc:
+        if exc.errno is not None and exc.filename in (None, str(temporary)):  # None: of a full disk
+            exc.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -63,6 +64,8 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     write_atomic(path, b"old")
     with pytest.raises(KeyError):
         write_half(path)
+    with pytest.raises(OSError, match=r"\[Errno 28\] full: '.*file\.bin'"), open_atomic(path):
+        raise OSError(errno.ENOSPC, "full")
     assert path.read_bytes() == b"old"
     assert [*tmp_path.iterdir()] == [path]
 
