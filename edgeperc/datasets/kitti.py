@@ -266,7 +266,8 @@ class KittiObjects:
         rows = table or [{"name": name, "drive": name} for name in labeled]
         self.drives = {row["name"]: row["drive"] for row in rows}
         self.grades = {row["name"]: row.get("grade") or "A" for row in rows if row["name"] in labeled}
-        self.has_table, self.unlisted = bool(table), [name for name in labeled if name not in self.drives]
+        self.has_table, n = bool(table), len(labeled) - len(self.grades)
+        self.left_out = f"{root} has {n:,} labeled scans without a row in frames*.csv, which are left out" if n else ""
         if not self.grades:
             listed = f" of a scan in frames*.csv, such as {rows[0]['name']!r:.60}" if table else ""
             raise PointsError(f"{self.root} has no training/label_2/*.txt{listed}; expected a KITTI object set's root")

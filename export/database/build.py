@@ -98,12 +98,12 @@ def build(
         for name, drive in sorted(labeled.items())
         for split in ["train" if drive in fold_of else "test"]
     ]
-    notes = []
+    notes = [objects.left_out] if objects.left_out else []
     if drawn:
         notes.append(
             f"{len(drawn)} drawn scenes, such as {min(drawn)}, are not in {plan.kitti}; their roads are not used"
         )
-    if len({job.drive for job in jobs}) == len(jobs) > 1:
+    if not objects.has_table and len(jobs) > 1:
         notes.append("no frames.csv: each scan counts as a drive, so scans of one drive may be in different folds")
     unknown = set(test_drives) - {job.drive for job in jobs}
     if unknown:

@@ -626,8 +626,12 @@ def test_notes_report_what_a_data_set_lacks(kitti: Path, model: str, polygons: P
     report = build(plan_of(root, tmp_path / "out", model), polygons=[polygons], test_drives=["000002"], workers=1)
     assert len(report.notes) == 2
     assert "000007" in report.notes[0]
-    assert "frames.csv" in report.notes[1]
+    assert "no frames.csv" in report.notes[1]
     assert TopViewDatabase(tmp_path / "out", "test").names == ["000002"]
+    (root / "frames.csv").write_text("name,drive\n000000,one\n000001,other\n")
+    report = build(plan_of(root, tmp_path / "two", model), workers=1)
+    assert report.notes == (f"{root} has 1 labeled scans without a row in frames*.csv, which are left out",)
+    assert report.scenes == 2
 
 
 def test_roads_of_other_scans_are_refused(kitti: Path, model: str, tmp_path: Path) -> None:
