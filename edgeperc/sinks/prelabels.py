@@ -50,8 +50,7 @@ class PrelabelSink:
     With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
     the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
     place there is known (``origin_m``); KITTI's are in the frame of the camera, where ``calib/NAME.txt`` puts
-    the file's points. A scan without boxes gets an empty file. Labels that are there and differ stay: they may be
-    corrected, or the truth.
+    these points. A scan without boxes gets an empty file. Labels that are there and differ stay: perhaps the truth.
 
     - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
