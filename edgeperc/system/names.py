@@ -7,7 +7,12 @@ import reprlib
 from collections.abc import Iterable
 from pathlib import PurePath, PureWindowsPath
 
+from ..errors import OptionError
+
 MAX_NAME = 200
+_PICTURES = {
+    f".{kind}" for kind in ("avi", "bmp", "gif", "jpeg", "jpg", "mp4", "pdf", "png", "svg", "tif", "tiff", "webp")
+}
 _MAX_COMPARED = 60
 _NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._+-]*[A-Za-z0-9_+-])?")
 # Digits but those behind a decimal point: 1700.5 comes after 1700.25.
@@ -49,3 +54,9 @@ def check_name(field: str, name: str, error: type[Exception]) -> None:
             f"{field} {reprlib.repr(name)}; expected a plain file name: letters a-z, digits, '_', '.', '+' and '-', "
             "the first a letter, digit or '_', without '..', and none that Windows reserves, such as nul"
         )
+
+
+def check_picture(path: PurePath | str, suffix: str) -> None:
+    """Refuse a path that is named as another kind of picture or film. Raises OptionError."""
+    if PurePath(path).suffix.lower() in _PICTURES - {suffix}:
+        raise OptionError(f"{path} would hold a picture in {suffix}; expected a name that ends so")

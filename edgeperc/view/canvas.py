@@ -13,6 +13,7 @@ import numpy as np
 
 from ..system.atomic import write_atomic
 from ..system.extras import require
+from ..system.names import check_picture
 from ..types.points import Floats
 from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
@@ -36,6 +37,7 @@ def new_figure(width: int, height: int) -> Any:
 
 def as_png(figure: Any, path: str | Path | None) -> bytes:
     """Encode the figure as a PNG, and write it to ``path`` unless that is None."""
+    check_picture(path or "", ".png")
     from PIL import Image  # a dependency of matplotlib
 
     figure.canvas.draw()

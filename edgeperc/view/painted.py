@@ -66,6 +66,8 @@ def draw_painted(
         matplotlib is not installed.
     ImageError, PointsError, CalibrationError
         The image, the points and the calibration do not belong to the perception.
+    OptionError
+        ``path`` is named as a picture of another kind.
     OSError
         The file cannot be written.
     """

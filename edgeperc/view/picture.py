@@ -80,6 +80,8 @@ def draw(perception: Perception, points: ArrayLike, path: str | Path | None = No
         matplotlib is not installed.
     PointsError
         ``points`` is not the scan that was perceived.
+    OptionError
+        ``path`` is named as a picture of another kind.
     OSError
         The file cannot be written.
     """
@@ -146,6 +148,8 @@ def draw_image(perception: Perception, image: Bytes, path: str | Path | None = N
         matplotlib is not installed.
     ImageError
         ``image`` is not the image that was perceived.
+    OptionError
+        ``path`` is named as a picture of another kind.
     OSError
         The file cannot be written.
     """

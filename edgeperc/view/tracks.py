@@ -18,6 +18,7 @@ from ..ground.planes import find_ground, heights_above
 from ..system.atomic import write_atomic
 from ..system.clock import elapsed_s
 from ..system.extras import require
+from ..system.names import check_picture
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Perception
@@ -122,10 +123,13 @@ def draw_tracks(
         pillow is not installed.
     TrackingError
         There are fewer than two scans, or ``under`` or ``mountings`` are of another number of scans.
+    OptionError
+        ``path`` is named as a picture of another kind.
     OSError
         The file cannot be written.
     """
     require("PIL", "view", "Drawing an animation", package="pillow")
+    check_picture(path or "", ".gif")
     if len(scans) < 2:
         raise TrackingError(
             f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "

@@ -442,6 +442,8 @@ def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path: Path) -> None:
     )
     png = draw_mistakes([right, missed, false, points], tmp_path / "worst.png", title="a title", columns=2)
     assert (tmp_path / "worst.png").read_bytes() == png
+    with pytest.raises(OptionError, match=r"worst.jpg would hold a picture in .png"):
+        draw_mistakes([missed], tmp_path / "worst.jpg")
     picture = pixels(png)
     # Three panels: the first scan has no mistake. Two are 762 pixels wide and 776 high, below 168 of legend.
     assert picture.shape == (168 + 2 * (776 + 84 + 20), 1600, 3)
@@ -652,6 +654,8 @@ def test_tracks_lie_on_the_scan(
     path = tmp_path / "tracks.gif"
     content = draw_tracks(tracks, path, under=[flat] * 6, mountings=mountings, title="a drive \udcff")
     bare = draw_tracks(tracks, mountings=mountings, title="a drive")
+    with pytest.raises(OptionError, match=r"drive.mp4 would hold a picture in .gif"):
+        draw_tracks(tracks, path.with_name("drive.mp4"))
     assert path.read_bytes() == content
 
     def last(gif: bytes) -> np.ndarray:

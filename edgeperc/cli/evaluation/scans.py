@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...system.extras import require
+from ...system.names import check_picture
 from ...types.choices import CAMERA, RULES
 from ..arguments import (
     Commands,
@@ -108,6 +109,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     """Compare models with labeled scans."""
     if arguments.worst is not None:
         require("matplotlib", "view", "Drawing a picture")
+        check_picture(arguments.worst, ".png")
     make_places(arguments.json, arguments.worst)
     from ...datasets.images import LabeledImages
 

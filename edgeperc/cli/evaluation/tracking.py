@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import PointsError
 from ...system.extras import require
+from ...system.names import check_picture
 from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
 from ..output import lines_last, make_places, many, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
@@ -90,6 +91,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
     """Print tracking figures on KITTI's sequences."""
     if arguments.gif is not None:
         require("PIL", "view", "Drawing an animation", package="pillow")
+        check_picture(arguments.gif, ".gif")
     if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
     arguments.classes = [*dict.fromkeys(arguments.classes)]
