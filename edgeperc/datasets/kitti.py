@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -271,6 +272,11 @@ class KittiObjects:
         if not self.grades:
             listed = f" of a scan in frames*.csv, such as {rows[0]['name']!r:.60}" if table else ""
             raise PointsError(f"{self.root} has no training/label_2/*.txt{listed}; expected a KITTI object set's root")
+
+    def tell_left_out(self) -> None:
+        """Warn of labeled scans without a row in the table."""
+        if self.left_out:
+            warnings.warn(self.left_out, stacklevel=3)
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
         """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""

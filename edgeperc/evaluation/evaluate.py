@@ -105,8 +105,7 @@ def evaluate(
     for objects in map(KittiObjects, filter(_is_kitti, map(Path, datasets))):
         if not objects.has_table:
             _tell_no_drives(objects.root, "none is held back. docs/concepts/measure.md shows how to write it")
-        elif objects.left_out:
-            warnings.warn(objects.left_out, stacklevel=2)
+        objects.tell_left_out()
     split = split or ("test" if fold is None else "validation")
     job = _Job(tuple(datasets), tuple(models), perceiving, split, fold, road_by, mounted)
     folders = job.folders()

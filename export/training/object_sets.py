@@ -57,6 +57,7 @@ def write_samples(
 
     if kitti is not None:
         objects = KittiObjects(kitti)
+        objects.tell_left_out()
         train = objects.names("train")
         groups = {f"kitti-{k}": [n for n in train if fold_of(objects.drives[n]) == k] for k in range(len(FOLDS))}
         groups |= {"kitti-other": [n for n in train if fold_of(objects.drives[n]) is None]}

@@ -178,6 +178,7 @@ def _real(
     watched: list[Labeled] = []
     only_simulated = recipe.simulated_share == 1.0
     if kitti is not None:
+        kitti.tell_left_out()
         names = kitti.names("train") if only_simulated else kitti.names("validation", fold=fold)
         chosen = _few_of_each_drive(names, [kitti.drives[name] for name in names])
         watched.append(real_scans(kitti, chosen, classes=recipe.classes))
