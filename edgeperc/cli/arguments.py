@@ -88,7 +88,7 @@ def add_sensor(group: Options, *, required: bool = False, of_capture: bool = Fal
     group(
         "--sensor SENSOR",
         "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
-        "pandaset, semantickitti, vod), a .json file written by 'edgeperc "
+        "nuscenes, pandaset, semantickitti, vod), a .json file written by 'edgeperc "
         "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
         "are found in the points of the first scans" + (" (required)" if required else f" (default: {default})"),
         required=required,
