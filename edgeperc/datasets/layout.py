@@ -35,6 +35,7 @@ PARTS = (*STATIC, "static object")
 SCHEMA = 1
 LAYOUTS = Path(__file__).with_name("layouts")
 BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
+WITH_RIDER = ".with_rider"  # after the class of a box, by its attribute in nuScenes' tables
 SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 _SENSOR_KEYS = {"like", "name", "elevations_deg", "columns", "remission_range", "min_range_m", "max_range_m"}
 _CLASS_NAME = re.compile(r"[a-z][a-z0-9 _-]{0,30}")
@@ -164,13 +165,13 @@ def point_class_names(layout: ScanLayout) -> tuple[str, ...]:
 
 def class_of_name(name: str, classes: Mapping[str, str], path: Path, kind: str) -> str:
     """The class that a description gives to a name in a label file."""
-    key = name.lower()
-    if key not in classes and ANY not in classes:
+    key = next((each for each in (name.lower(), name.lower().removesuffix(WITH_RIDER)) if each in classes), ANY)
+    if key not in classes:
         raise PointsError(
             f"{path}: no class for {name!r:.60}; add it to {kind} of the description, with a class or 'ignore', or add "
             "'*' for all others"
         )
-    return classes[key] if key in classes else classes[ANY]
+    return classes[key]
 
 
 def _classes(given: Mapping[str, Any], key: str) -> Mapping[str, str]:
@@ -202,12 +203,8 @@ def _sensor(given: Mapping[str, Any], folder: Path | None) -> SensorProfile:
         else:
             raise PointsError("sensor: expected 'like' with the name of a sensor, or name, elevations_deg and columns")
     else:
-        _FIELDS.refuse(
-            "sensor",
-            named,
-            "the name of a sensor, the .json file of a profile, or an object with some of "
-            f"{', '.join(sorted(_SENSOR_KEYS))}",
-        )
+        expected = "the name of a sensor, the .json file of a profile, or an object with some of "
+        _FIELDS.refuse("sensor", named, expected + ", ".join(sorted(_SENSOR_KEYS)))
     if "mounting" in given:
         sensor = replace(sensor, mounting=_MOUNTING.read(Mounting, given["mounting"], "mounting"))
     return sensor

@@ -211,10 +211,11 @@ class ScanFolder:
         self.layout = layout if isinstance(layout, ScanLayout) else read_layout(layout)
         self._point_numbers: Bytes | None = None
         self._tree: Tree | None = None
+        self._names_file = "semseg_classes.json"
         if self.layout.files in TREES and (self.root / "velodyne").is_dir():
             self.layout = replace(self.layout, files="plain")
         if self.layout.files in TREES:
-            self._tree = TREES[self.layout.files](self.root)
+            self._tree, self._names_file = TREES[self.layout.files](self.root), "category.json"
             self.scans, self.drives = self._tree.scans, self._tree.drives
         else:
             self.scans = self._scans()
@@ -278,11 +279,8 @@ class ScanFolder:
         if sequence:
             path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
             return path if kind == "points" and path.is_file() else None
-        candidates = {
-            "boxes": (boxes,),
-            "points": (f"semseg/{name}.u8", f"semseg/{name}.label"),
-            "drivable": (f"drivable/{name}.json",),
-        }[kind]
+        points, drivable = (f"semseg/{name}.u8", f"semseg/{name}.label"), (f"drivable/{name}.json",)
+        candidates = {"boxes": (boxes,), "points": points, "drivable": drivable}[kind]
         if kind == "boxes" and self.layout.box_format == "cvat" and name not in self._annotated:
             return None
         return next((self.root / path for path in candidates if (self.root / path).is_file()), None)
@@ -380,14 +378,14 @@ class ScanFolder:
         known[known] = self._point_numbers[numbers[known]] != IGNORE
         if not known.all():
             raise PointsError(
-                f"{path}: no name for {', '.join(map(str, numbers[~known][:5]))}; add it to semseg_classes.json or, in "
+                f"{path}: no name for {', '.join(map(str, numbers[~known][:5]))}; add it to {self._names_file} or, in "
                 "the description, to point_names"
             )
         return self._point_numbers[raw]
 
     def _numbers(self) -> Bytes:
         """Raw number of a class -> index into the description's classes, `IGNORE` if it has no name."""
-        names, source = self.layout.point_names, self.root / "semseg_classes.json"
+        names, source = self.layout.point_names, self.root / self._names_file
         if names is None and self._tree is not None:
             names = self._tree.point_names
         elif names is None:

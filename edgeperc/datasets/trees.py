@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -21,13 +21,15 @@ from ..types.perception import Box
 from ..types.points import Floats, Points
 from .annotations import read_json
 from .kitti import read_numbers
-from .layout import point_names_of
+from .layout import WITH_RIDER, point_names_of
 
 _Row = TypeVar("_Row")
+_Json = dict[str, Any]
+_Test = Callable[[_Json], bool]
 _Annotation = tuple[str, Any, Any, Any]  # class, translation, rotation and size of a box, as nuScenes has them
 _Posed = tuple[str, Floats, list[float]]  # class, pose, and width, length and height of a box
 _TOP = "LIDAR_TOP"
-_WITH_RIDER = ".with_rider"
+_PLACE, _TURN = ("tx_m", "ty_m", "tz_m"), ("qx", "qy", "qz", "qw")
 _BYTE = 255.0  # Argoverse 2's intensities, which its profile has as 0..1
 
 
@@ -60,30 +62,25 @@ class NuScenes(Tree):
     def __init__(self, root: Path) -> None:
         self._tables = _folder_of_tables(root)
         self._root = self._tables.parent
-        self._frames = self._there()
-        self.scans = {name: self._root / frame.filename for name, (frame, _) in self._frames.items()}
+        self._frames, self.scans = self._key_frames()
         scenes = self._texts("scene", "name")
-        samples = dict(self._rows("sample", lambda row: (_text(row["token"]), scenes[row["scene_token"]])))
+        samples = self._by_token("sample", lambda row: scenes[row["scene_token"]])
         used = {frame.ego_pose_token for frame, _ in self._frames.values()}
-        egos = dict(
-            self._rows(
-                "ego_pose",
-                lambda row: (row["token"], _pose(row["translation"], row["rotation"])),
-                lambda row: row["token"] in used,
-            )
-        )
+        egos = self._by_token("ego_pose", _pose_of, lambda row: row["token"] in used)
         try:
             self.drives = {name: samples[frame.sample_token] for name, (frame, _) in self._frames.items()}
             self._egos = {name: egos[frame.ego_pose_token] for name, (frame, _) in self._frames.items()}
         except KeyError as exc:
             raise PointsError(f"{self._tables}: sample_data.json names a row {exc} that is not there") from exc
         self._boxes, numbered = self._annotated(), lambda row: (str(row["index"]), row["name"])
-        named = dict(self._rows("category", numbered, lambda row: "index" in row))
+        named = dict(self._rows("category", numbered, lambda row: row.get("index") is not None))
         self.point_names = point_names_of(named, str(self._tables / "category.json"))
-        self._numbers: dict[str, str] = {}
-        if named and (self._tables / "lidarseg.json").is_file():
+        self._numbers: dict[str, Path] = {}
+        if (self._tables / "lidarseg.json").is_file():
+            tokens = {frame.token for frame, _ in self._frames.values()}
             files = self._rows("lidarseg", lambda row: (_text(row["sample_data_token"]), _text(row["filename"])))
-            self._numbers = dict(files)
+            of = {token: self._root / file for token, file in files if token in tokens}
+            self._numbers = _present(of, self._root, "files of lidarseg.json", all_may_lack=True)
         if self._boxes is None and not self._numbers:
             raise PointsError(f"{self._tables} has no labels; expected rows in sample_annotation.json or lidarseg.json")
 
@@ -92,50 +89,49 @@ class NuScenes(Tree):
         frame, sensor = self._frames[name]
         ahead = math.atan2(sensor[1, 0], sensor[0, 0])
         points = read_points(self.scans[name])
-        into = _about_z(ahead) @ np.linalg.inv(self._egos[name] @ sensor)
+        about_z = math.cos(0.5 * ahead), 0.0, 0.0, math.sin(0.5 * ahead)
+        into = _pose((0.0, 0.0, 0.0), about_z) @ np.linalg.inv(self._egos[name] @ sensor)
         boxes = None
         if self._boxes is not None:
             rows = self._boxes.get(frame.sample_token, ())
             try:
                 boxes = [_box(kind, _pose(place, turn), size, into) for kind, place, turn, size in rows]
             except (TypeError, ValueError) as exc:
-                raise PointsError(
-                    f"{self._tables / 'sample_annotation.json'}: a box of {name} is none ({exc})"
-                ) from exc
+                raise PointsError(f"{self._tables}/sample_annotation.json: a box of {name} is none ({exc})") from exc
         file = self._numbers.get(frame.token)
-        numbers = None if file is None else read_numbers(self._root / file, len(points))
+        numbers = None if file is None else read_numbers(file, len(points))
         return Labeled(turned(points, -ahead) if ahead else points, boxes, numbers, None)
 
-    def _there(self) -> dict[str, tuple[_Frame, Floats]]:
-        """The key frames whose files are there, by the name of the file, and the pose of their LiDAR in the vehicle."""
+    def _key_frames(self) -> tuple[dict[str, tuple[_Frame, Floats]], dict[str, Path]]:
+        """The key frames whose files are there, with the pose of their LiDAR in the vehicle; and these files."""
         modalities, channels_of = self._texts("sensor", "modality"), self._texts("sensor", "channel")
-        lidars = {token: channel for token, channel in channels_of.items() if modalities[token] == "lidar"}
-        channels = sorted({*lidars.values()})
-        if _TOP not in channels and len(channels) != 1:
-            raise PointsError(f"{self._tables} has LiDARs {', '.join(channels) or 'none'}; expected one, or {_TOP}")
-        channel = _TOP if _TOP in channels else channels[0]
-        poses = dict(
-            self._rows(
-                "calibrated_sensor",
-                lambda row: (_text(row["token"]), _pose(row["translation"], row["rotation"])),
-                lambda row: lidars.get(row["sensor_token"]) == channel,
-            )
+        mounted = self._by_token(
+            "calibrated_sensor",
+            lambda row: (channels_of[row["sensor_token"]], _pose_of(row)),
+            lambda row: modalities.get(row["sensor_token"]) == "lidar",
         )
         frames = self._rows(
             "sample_data",
             lambda row: _Frame(*(_text(row[key]) for key in _Frame._fields)),
-            lambda row: row["is_key_frame"] and row["calibrated_sensor_token"] in poses,
+            lambda row: row["is_key_frame"] and row["calibrated_sensor_token"] in mounted,
         )
-        there = {_stem(frame.filename): frame for frame in frames if (self._root / frame.filename).is_file()}
-        if len(there) < len(frames):
-            lacking = next(frame.filename for frame in frames if there.get(_stem(frame.filename)) is not frame)
-            told = f"{self._root}: of {len(frames):,} labeled scans {len(there):,} are there, and not {lacking}"
-            if not there:
-                raise PointsError(f"{told}; expected the set's files beside its tables")
-            warnings.warn(f"{told}; the others are left out", stacklevel=5)
-        if not there:
-            raise PointsError(f"{self._tables}: no key frame of a LiDAR; expected some in sample_data.json")
-        return {name: (frame, poses[frame.calibrated_sensor_token]) for name, frame in there.items()}
+        channels = sorted({mounted[frame.calibrated_sensor_token][0] for frame in frames})
+        if _TOP not in channels and len(channels) != 1:
+            of = f"key frames of LiDARs {', '.join(channels)}" if channels else "no key frame of a LiDAR"
+            raise PointsError(f"{self._tables}: sample_data.json has {of}; expected some of one, or of {_TOP}")
+        of_channel, named = _TOP if _TOP in channels else channels[0], dict[str, tuple[_Frame, Floats]]()
+        for frame in frames:
+            channel, pose = mounted[frame.calibrated_sensor_token]
+            if channel == of_channel and named.setdefault(_stem(frame.filename), (frame, pose))[0] is not frame:
+                raise PointsError(f"{self._tables}: two key frames are called {_stem(frame.filename)}; expected one")
+        files = {name: self._file(frame.filename) for name, (frame, _) in named.items()}
+        there = _present(files, self._root, "labeled scans")
+        return {name: named[name] for name in there}, there
+
+    def _file(self, name: str) -> Path:
+        """A file of the set; Lyft's ``lidar`` is ``train_lidar`` beside ``train_data`` on Kaggle."""
+        path, (part, data, _) = self._root / name, self._tables.name.rpartition("data")
+        return self._root / f"{part}{name}" if part and data and not path.is_file() else path
 
     def _annotated(self) -> dict[str, list[_Annotation]] | None:
         """The boxes by sample; None for a set without labels."""
@@ -146,8 +142,8 @@ class NuScenes(Tree):
         wanted = {frame.sample_token for frame, _ in self._frames.values()}
 
         def labeled(row: dict[str, Any]) -> tuple[str, _Annotation]:
-            ridden = any(attributes[token].endswith(_WITH_RIDER) for token in row["attribute_tokens"])
-            kind = categories[instances[row["instance_token"]]] + (_WITH_RIDER if ridden else "")
+            ridden = any(attributes[token].endswith(WITH_RIDER) for token in row["attribute_tokens"])
+            kind = categories[instances[row["instance_token"]]] + (WITH_RIDER if ridden else "")
             return row["sample_token"], (kind, row["translation"], row["rotation"], row["size"])
 
         boxes = dict[str, list[_Annotation]]()
@@ -155,9 +151,7 @@ class NuScenes(Tree):
             boxes.setdefault(sample, []).append(box)
         return boxes or None  # a test set's table is empty
 
-    def _rows(
-        self, table: str, row_of: Callable[[dict[str, Any]], _Row], is_wanted: Callable[[dict[str, Any]], bool] = bool
-    ) -> list[_Row]:
+    def _rows(self, table: str, row_of: Callable[[_Json], _Row], is_wanted: _Test = bool) -> list[_Row]:
         """What is wanted of the rows of a table, of which one alone is kept at a time: some have gigabytes."""
         path = self._tables / f"{table}.json"
 
@@ -175,13 +169,14 @@ class NuScenes(Tree):
         except (OSError, RecursionError, UnicodeDecodeError, json.JSONDecodeError) as exc:
             raise PointsError(f"{path} cannot be read ({exc}); expected a table of nuScenes") from exc
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
-            raise PointsError(
-                f"{path} has a row that is not nuScenes' ({exc!r:.100}); expected docs/schema of its devkit"
-            ) from exc
+            told = f"{path} has a row that is not nuScenes' ({exc!r:.100}); expected docs/schema of its devkit"
+            raise PointsError(told) from exc
+
+    def _by_token(self, table: str, value_of: Callable[[_Json], _Row], is_wanted: _Test = bool) -> dict[str, _Row]:
+        return dict(self._rows(table, lambda row: (_text(row["token"]), value_of(row)), is_wanted))
 
     def _texts(self, table: str, key: str) -> dict[str, str]:
-        """A text of each row, by token."""
-        return dict(self._rows(table, lambda row: (_text(row["token"]), _text(row[key]))))
+        return self._by_token(table, lambda row: _text(row[key]))
 
 
 class _Frame(NamedTuple):
@@ -202,20 +197,20 @@ class Argoverse2(Tree):
         logs = [path.parent for depth in ("", "*/", "*/*/") for path in root.glob(f"{depth}annotations.feather")]
         if not logs:
             raise PointsError(f"{root} has no annotations.feather; expected LOG/annotations.feather, or SPLIT/LOG")
-        self.scans, self.drives = dict[str, Path](), dict[str, str]()
-        for log in sorted(logs):
-            for stamp in np.unique(_feather(log / "annotations.feather", "timestamp_ns")["timestamp_ns"]).tolist():
-                path = log / "sensors" / "lidar" / f"{stamp}.feather"
-                if path.is_file():
-                    self.scans[f"{log.name}_{stamp}"], self.drives[f"{log.name}_{stamp}"] = path, log.name
-        if not self.scans:
-            raise PointsError(f"{root} has no labeled sweeps; expected files LOG/sensors/lidar/STAMP.feather")
+        files = {
+            f"{log.name}_{stamp}": log / "sensors" / "lidar" / f"{stamp}.feather"
+            for log in sorted(logs)
+            for stamp in np.unique(_feather(log / "annotations.feather", "timestamp_ns")["timestamp_ns"]).tolist()
+        }
+        self.scans = _present(files, root, "labeled scans")
+        self.drives = {name: path.parents[2].name for name, path in self.scans.items()}
+        self._log = lru_cache(maxsize=2)(_log)
 
     def read(self, name: str) -> Labeled:
         """Read a sweep and its labels. Raises PointsError."""
         path = self.scans[name]
         try:
-            return self._read(path, int(path.stem), _log(path.parents[2]))
+            return self._read(path, int(path.stem), self._log(path.parents[2]))
         except PointsError:
             raise
         except (TypeError, ValueError) as exc:
@@ -245,30 +240,27 @@ class _Log(NamedTuple):
     areas: list[Floats] | None
 
 
-@lru_cache(maxsize=2)
 def _log(folder: Path) -> _Log:
-    place, turn = ("tx_m", "ty_m", "tz_m"), ("qx", "qy", "qz", "qw")
-    sensors = _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", "sensor_name", *place)
+    sensors = _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", "sensor_name", *_PLACE)
     names = sensors.pop("sensor_name").tolist()
     if "up_lidar" not in names:
         raise PointsError(f"{folder} has no calibration of up_lidar; expected it in egovehicle_SE3_sensor.feather")
     boxes = dict[int, list[_Posed]]()
     sizes = ("width_m", "length_m", "height_m")
-    rows = _feather(folder / "annotations.feather", "timestamp_ns", "category", *sizes, *place, *turn)
-    poses = _poses(rows, place, turn)
+    rows = _feather(folder / "annotations.feather", "timestamp_ns", "category", *sizes, *_PLACE, *_TURN)
+    poses = _poses(rows)
     for k, (stamp, kind) in enumerate(zip(rows["timestamp_ns"].tolist(), rows["category"].tolist(), strict=True)):
-        boxes.setdefault(stamp, []).append((kind, poses[k], [float(rows[size][k]) for size in sizes]))
+        boxes.setdefault(stamp, []).append((_text(kind), poses[k], [float(rows[size][k]) for size in sizes]))
     areas, egos = None, dict[int, Floats]()
     for path in folder.glob("map/log_map_archive_*.json"):
-        egos_of = _feather(folder / "city_SE3_egovehicle.feather", "timestamp_ns", *place, *turn)
-        egos = dict(zip(egos_of["timestamp_ns"].tolist(), _poses(egos_of, place, turn), strict=True))
+        egos_of = _feather(folder / "city_SE3_egovehicle.feather", "timestamp_ns", *_PLACE, *_TURN)
+        egos = dict(zip(egos_of["timestamp_ns"].tolist(), _poses(egos_of), strict=True))
         try:
             rings = [area["area_boundary"] for area in read_json(path)["drivable_areas"].values()]
             areas = [np.array([[corner[axis] for axis in "xyz"] for corner in ring], np.float64) for ring in rings]
         except (AttributeError, KeyError, TypeError, ValueError) as exc:
             raise PointsError(f"{path} is not a map of Argoverse 2 ({exc!r:.100}); expected drivable_areas") from exc
-    lidar = names.index("up_lidar")
-    return _Log(np.array([sensors[axis][lidar] for axis in place], np.float64), boxes, egos, areas)
+    return _Log(np.array([sensors[axis][names.index("up_lidar")] for axis in _PLACE], np.float64), boxes, egos, areas)
 
 
 def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
@@ -281,6 +273,18 @@ def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
         return {name: table.column(name).to_numpy() for name in columns}
     except (OSError, arrow.ArrowException, KeyError, ValueError) as exc:
         raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc
+
+
+def _present(files: Mapping[str, Path], root: Path, what: str, *, all_may_lack: bool = False) -> dict[str, Path]:
+    """Those of the files that are there, as sets are downloaded in parts. Raises PointsError if none is."""
+    there = {name: path for name, path in files.items() if path.is_file()}
+    lacking = next((path for name, path in files.items() if name not in there), None)
+    told = f"{root}: of {len(files):,} {what} {len(there):,} are there, and not {lacking or 'more'}"
+    if not there and not all_may_lack:
+        raise PointsError(f"{told}; expected the set's files beside its tables")
+    if lacking:
+        warnings.warn(f"{told}; the others are left out", stacklevel=5)
+    return there
 
 
 def _folder_of_tables(root: Path) -> Path:
@@ -300,6 +304,10 @@ def _stem(filename: str) -> str:
     return Path(filename).name.removesuffix(".bin").removesuffix(".pcd")
 
 
+def _pose_of(row: _Json) -> Floats:
+    return _pose(row["translation"], row["rotation"])
+
+
 def _pose(translation: Iterable[Any], rotation: Iterable[Any]) -> Floats:
     """Matrix (4, 4) of x, y, z [m] and a quaternion w, x, y, z."""
     (w, *xyz), (east, north, up) = map(float, rotation), map(float, translation)
@@ -313,11 +321,10 @@ def _text(value: object) -> str:
     return value
 
 
-def _poses(columns: Mapping[str, NDArray[Any]], place: Sequence[str], turn: Sequence[str]) -> Floats:
+def _poses(columns: Mapping[str, NDArray[Any]]) -> Floats:
     """Matrices (n, 4, 4) of a table."""
-    return _matrices(
-        *(np.column_stack([columns[name] for name in names]).astype(np.float64) for names in (place, turn))
-    )
+    place, turn = (np.column_stack([columns[name] for name in names]).astype(np.float64) for names in (_PLACE, _TURN))
+    return _matrices(place, turn)
 
 
 def _matrices(positions: Floats, quaternions: Floats) -> Floats:
@@ -325,10 +332,6 @@ def _matrices(positions: Floats, quaternions: Floats) -> Floats:
     if not (quaternions.shape[1] == 4 and np.isfinite(positions).all() and (np.abs(norms - 1.0) < 0.1).all()):
         raise ValueError("a pose that is not finite, or whose quaternion has not the length 1")
     return poses_of(positions, quaternions / norms)
-
-
-def _about_z(angle_rad: float) -> Floats:
-    return poses_of(np.zeros((1, 3)), np.array([[0.0, 0.0, math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)]]))[0]
 
 
 def _box(kind: str, pose: Floats, size: Iterable[float], into: Floats) -> Box:

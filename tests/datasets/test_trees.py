@@ -8,6 +8,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from strategies import JSON
 RIGHT = math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5)  # w, x, y, z of a quarter turn to the right
 SEEN = {"car": "vehicle.car", "pedestrian": "human.pedestrian.adult", "cyclist": "vehicle.bicycle"}
 AV2 = {"car": "REGULAR_VEHICLE", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLIST"}
+FILE = "n015__LIDAR_TOP__"
 EGO_M = np.array([1.0, 0.2, 1.84])  # the LiDAR in the vehicle
 
 
@@ -90,7 +92,7 @@ def nuscenes(root: Path, streets: list[tuple[np.ndarray, list[Box]]], **changes:
         **{name: [] for name in ("sample", "sample_data", "ego_pose", "sample_annotation", "lidarseg")},
     }
     for k, (points, boxes) in enumerate(streets):
-        vehicle, file = Vehicle(k), f"samples/LIDAR_TOP/n015__LIDAR_TOP__{k}.pcd.bin"
+        vehicle, file = Vehicle(k), f"samples/LIDAR_TOP/{FILE}{k}.pcd.bin"
         tables["sample"].append({"token": f"t{k}", "scene_token": "s"})
         tables["ego_pose"].append({"token": f"e{k}", "translation": [*vehicle.place], "rotation": [*vehicle.turn]})
         data = {"token": f"d{k}", "sample_token": f"t{k}", "ego_pose_token": f"e{k}", "is_key_frame": True}
@@ -145,7 +147,7 @@ def argoverse2(root: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> Path:
         for box in boxes if k < len(streets) else []:
             size = dict(zip(("length_m", "width_m", "height_m"), box.size, strict=True))
             pose = dict(zip(turn + place, [*about_z(box.yaw), *(np.array(box.center) + EGO_M)], strict=True))
-            rows.append({"timestamp_ns": stamp, "category": AV2[box.label], "num_interior_pts": 9, **size, **pose})
+            rows.append({"timestamp_ns": stamp, "category": AV2.get(box.label), "num_interior_pts": 9, **size, **pose})
     sensors = {"sensor_name": ["ring_front_center", "up_lidar"], "qw": [1.0, 1.0]}
     sensors |= {name: [0.0, value] for name, value in zip(place, EGO_M.tolist(), strict=True)}
     write(log / "calibration" / "egovehicle_SE3_sensor.feather", sensors)
@@ -153,7 +155,7 @@ def argoverse2(root: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> Path:
         write(log / f"{file}.feather", {name: [row[name] for row in of] for name in of[0]})
     corners = [Vehicle(0).place + rotated(Vehicle(0).turn, [x, y, 0.0]) for x, y in ((0, -3), (30, -3), (30, 4))]
     boundary = [dict(zip("xyz", corner.tolist(), strict=True)) for corner in corners]
-    (log / "map").mkdir()
+    (log / "map").mkdir(exist_ok=True)
     areas = {"drivable_areas": {"1": {"area_boundary": boundary, "id": 1}}, "lane_segments": {}}
     (log / "map" / "log_map_archive_7fab____PIT_city_1.json").write_text(json.dumps(areas))
     return root
@@ -225,6 +227,31 @@ def changed(table: str, rows: Any) -> Callable[[Path], None]:
     return change
 
 
+def replaced(path: Path, *pairs: tuple[str, str]) -> None:
+    text = path.read_text()
+    for before, after in pairs:
+        text = text.replace(before, after)
+    path.write_text(text)
+
+
+def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
+    """T4 lists LiDARs without scans, and classes without a number; Lyft's scans on Kaggle lie in train_lidar."""
+    folder = ScanFolder(nuscenes(tmp_path, streets[:1]), "nuscenes")
+    (expected,) = map(folder.frame, folder.drives)
+    tables = (tmp_path / "v1.0-mini").rename(tmp_path / "train_data")
+    (tmp_path / "samples").rename(tmp_path / "train_samples")
+    (tables / "lidarseg.json").unlink()
+    replaced(tables / "sensor.json", ("LIDAR_TOP", "LIDAR_CONCAT"), ("camera", "lidar"))
+    replaced(tables / "sample_data.json", ("on-c", "none"))
+    replaced(tables / "category.json", ('"index": 17', '"index": null'))
+    layout = replace(folder.layout, boxes={"vehicle.bicycle": "cyclist", "*": "car"})
+    (frame,) = map((other := ScanFolder(tables, layout)).frame, other.drives)
+    np.testing.assert_array_equal(frame.points, expected.points)
+    assert frame.boxes is not None
+    assert expected.boxes is not None
+    assert [box.label == "cyclist" for box in frame.boxes] == [box.label == "cyclist" for box in expected.boxes]
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -239,12 +266,18 @@ def changed(table: str, rows: Any) -> Callable[[Path], None]:
         (changed("ego_pose", []), "a row 'e0' that is not there"),
         (changed("scene", []), "sample.json has a row that is not nuScenes'"),
         (
-            changed("sensor", [{"token": k, "channel": k, "modality": "lidar"} for k in "ab"]),
-            "LiDARs a, b; expected one",
+            changed("sensor", [{"token": k, "channel": k, "modality": "lidar"} for k in "lc"]),
+            "LiDARs c, l; expected some of one",
         ),
         (
             changed("category", [{"token": kind, "name": kind, "index": -1} for kind in SEEN.values()]),
             "names by number",
+        ),
+        (
+            lambda root: replaced(
+                root / "v1.0-mini/sample_data.json", ("false", "true"), ("sweeps/LIDAR_TOP/", f"{FILE}")
+            ),
+            "two key frames are called n015__LIDAR_TOP__0; expected one",
         ),
     ],
 )
@@ -260,7 +293,7 @@ def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: list[tuple[np.nd
     """Whole sets are downloaded in parts; without boxes, points alone are labeled, and without both nothing is."""
     root = nuscenes(tmp_path, streets, sample_annotation=[])
     (root / "samples" / "LIDAR_TOP" / "n015__LIDAR_TOP__0.pcd.bin").unlink()
-    with pytest.warns(UserWarning, match="of 2 labeled scans 1 are there, and not samples/.*__0.pcd.bin"):
+    with pytest.warns(UserWarning, match="of 2 labeled scans 1 are there, and not .*/samples/.*__0.pcd.bin"):
         folder = ScanFolder(root, "nuscenes")
     frame = folder.frame("n015__LIDAR_TOP__1")
     assert frame.boxes is None
@@ -268,9 +301,16 @@ def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: list[tuple[np.nd
     (root / "lidarseg" / "1.bin").write_bytes(b"cut")
     with pytest.raises(PointsError, match="3 labels for a scan of"):
         folder.frame("n015__LIDAR_TOP__1")
-    (root / "v1.0-mini" / "lidarseg.json").unlink()
-    with pytest.warns(UserWarning, match="are there"), pytest.raises(PointsError, match="has no labels"):
+    (root / "lidarseg" / "1.bin").unlink()
+    with (
+        pytest.warns(UserWarning, match=r"scans 1 are there"),
+        pytest.warns(UserWarning, match=r"json 0 are there, and not .*/lidarseg/1.bin"),
+        pytest.raises(PointsError, match="no labels"),
+    ):
         ScanFolder(root, "nuscenes")
+    replaced(nuscenes(tmp_path / "unnamed", streets[:1]) / "v1.0-mini" / "category.json", ("index", "number"))
+    with pytest.raises(PointsError, match=r"no name for 24; add it to category\.json"):
+        ScanFolder(tmp_path / "unnamed", "nuscenes").frame(f"{FILE}0")
 
 
 @given(
@@ -308,6 +348,13 @@ def test_damaged_logs_are_refused(
     argoverse2(tmp_path / "small", [(streets[0][0], [Box("car", 1.0, (9.0, 0.0, 0.0), (4.0, 0.0, 1.6), 0.0)])])
     with pytest.raises(PointsError, match=r"7fab: a 'REGULAR_VEHICLE' of 0 x 4 x 1\.6 m; expected sizes above 0"):
         ScanFolder(tmp_path / "small", "av2").frame(name)
+    argoverse2(tmp_path / "small", [(streets[0][0], [replace(streets[0][1][0], label="none")])])
+    with pytest.raises(PointsError, match="None in place of a text"):
+        ScanFolder(tmp_path / "small", "av2").frame(name)  # labels that were changed are read again
+    argoverse2(tmp_path / "part", streets)
+    (tmp_path / "part/val/7fab/sensors/lidar" / f"{10**18}.feather").unlink()
+    with pytest.warns(UserWarning, match="of 2 labeled scans 1 are there, and not .*/val/7fab/sensors"):
+        ScanFolder(tmp_path / "part", "av2")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"edgeperc\[argoverse\]"):
         ScanFolder(root, "av2")
