@@ -80,7 +80,7 @@ def build_parser() -> argparse.ArgumentParser:
     def command(
         name: str, help: str, run: Callable[[argparse.Namespace], int | None], **defaults: Any
     ) -> argparse.ArgumentParser:
-        made: argparse.ArgumentParser = commands.add_parser(name, help=help)
+        made: argparse.ArgumentParser = commands.add_parser(name, help=help, description=f"{help}.")
         made.set_defaults(run=run, **defaults)
         return made
 
@@ -432,7 +432,7 @@ def _quantize(args: argparse.Namespace) -> None:
 
 
 def _add_agree(command: Command) -> None:
-    does = "compare bf16 and int8 with fp32, and write the agreement into the cards"
+    does = "compare bf16 and int8 with fp32, and write the agreement into the cards of these files, which auto reads"
     add = options(command("agree", does, _agree))
     add("models MODEL...", "a network's name, or its files, one of them in fp32")
     _add_shared(add, "--kitti KITTI", "--semantickitti SEMANTICKITTI", "--camvid CAMVID")
@@ -449,7 +449,7 @@ def _agree(args: argparse.Namespace) -> None:
 
     how = keywords(args, "kitti", "semantickitti", "camvid", "split", n_scans="scans")
     measured = agree(args.models, labeled=[ScanFolder.parse(text) for text in args.labeled], **how)
-    for line in summary(measured):
+    for line in (*summary(measured), "written into the cards of these files, which precision auto reads"):
         print_line(line)
     if "bf16" not in measured:
         print_line("bf16 was not measured; it needs a processor with bf16 and openvino: pip install 'edgeperc[peers]'")

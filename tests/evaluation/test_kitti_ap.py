@@ -233,4 +233,4 @@ def test_a_missing_table_says_why() -> None:
     unknown = labels(("car", label_row(box("car", 20.0, 0.0), occlusion=3)))
     record = Record("a", "drive", {("kitti",): table_of((unknown, []))})
     (line,) = filter(None, box_table_lines(figures([record])))
-    assert line == "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"
+    assert line == "no car, pedestrian or cyclist is to find: with enough points, and within KITTI's image limits"

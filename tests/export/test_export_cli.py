@@ -35,6 +35,7 @@ def test_every_option_has_a_help_text() -> None:
         for action in parser._actions:  # none of them has commands
             assert action.help, f"{name} {action.option_strings or action.dest} has no help"
             assert len(action.help.split()) > 1, f"{name} {action.option_strings}: {action.help}"
+        assert parser.description, name
         parser.format_help()  # raises ValueError for a stray % in a help text
 
 

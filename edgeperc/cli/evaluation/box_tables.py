@@ -37,7 +37,7 @@ def box_table_lines(figures: Mapping[str, Any]) -> list[str]:
                     rows.append(((label, f"{overlap} {level}{marks}"), row))
     lines = table_lines("boxes as KITTI's benchmark measures them: AP at the IoU that is named", _KITTI_COLUMNS, rows)
     if "kitti" in figures and not rows:
-        lines = ["", "no labeled object is within the limits of KITTI's benchmark, such as an occlusion of 0 to 2"]
+        lines = ["", "no car, pedestrian or cyclist is to find: with enough points, and within KITTI's image limits"]
     centers = figures.get("centers", {})
     rows = [
         ((f"{label}{FEW * row.get('few', False)}", ""), {**row, **_plain_errors(row)})
