@@ -28,7 +28,6 @@ from strategies import JSON
 RIGHT = math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5)  # w, x, y, z of a quarter turn to the right
 SEEN = {"car": "vehicle.car", "pedestrian": "human.pedestrian.adult", "cyclist": "vehicle.bicycle"}
 AV2 = {"car": "REGULAR_VEHICLE", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLIST"}
-FILE = "n015__LIDAR_TOP__"
 EGO_M = np.array([1.0, 0.2, 1.84])  # the LiDAR in the vehicle
 
 
@@ -51,12 +50,8 @@ def about_z(angle: float) -> tuple[float, float, float, float]:
 @pytest.fixture(scope="module")
 def streets() -> list[tuple[np.ndarray, list[Box]]]:
     """Scans with x ahead and the boxes of their vehicles and people."""
-    found = []
-    for seed in (3, 4):
-        scene = random_scene(seed)
-        scan = simulate(scene, "hdl-32e", seed=seed)
-        found.append((scan.points, [box for box in scan.boxes if box.label in SEEN]))
-    return found
+    scans = [simulate(random_scene(seed), "hdl-32e", seed=seed) for seed in (3, 4)]
+    return [(scan.points, [box for box in scan.boxes if box.label in SEEN]) for scan in scans]
 
 
 class Vehicle:
@@ -92,7 +87,7 @@ def nuscenes(root: Path, streets: list[tuple[np.ndarray, list[Box]]], **changes:
         **{name: [] for name in ("sample", "sample_data", "ego_pose", "sample_annotation", "lidarseg")},
     }
     for k, (points, boxes) in enumerate(streets):
-        vehicle, file = Vehicle(k), f"samples/LIDAR_TOP/{FILE}{k}.pcd.bin"
+        vehicle, file = Vehicle(k), f"samples/LIDAR_TOP/n015__LIDAR_TOP__{k}.pcd.bin"
         tables["sample"].append({"token": f"t{k}", "scene_token": "s"})
         tables["ego_pose"].append({"token": f"e{k}", "translation": [*vehicle.place], "rotation": [*vehicle.turn]})
         data = {"token": f"d{k}", "sample_token": f"t{k}", "ego_pose_token": f"e{k}", "is_key_frame": True}
@@ -100,7 +95,7 @@ def nuscenes(root: Path, streets: list[tuple[np.ndarray, list[Box]]], **changes:
         tables["sample_data"] += [
             data | lidar,
             data | {"token": f"c{k}", "calibrated_sensor_token": "on-c", "filename": f"samples/CAM_FRONT/{k}.jpg"},
-            data | lidar | {"token": f"w{k}", "is_key_frame": False, "filename": f"sweeps/LIDAR_TOP/{k}.pcd.bin"},
+            data | lidar | {"token": f"w{k}", "is_key_frame": False, "filename": file.replace("samples", "sweeps")},
         ]
         for box in boxes:
             place, turn = vehicle.world(box, EGO_M)
@@ -179,10 +174,8 @@ def test_nuscenes_is_read_from_its_tables(tmp_path: Path, streets: list[tuple[np
         frame = folder.frame(f"n015__LIDAR_TOP__{k}")
         check(frame, points, boxes, 1e-4)
         np.testing.assert_allclose(frame.points[:, 3], 255.0 * points[:, 3], rtol=1e-6)
-        assert {*zip(frame.labels(("background", "road")).tolist(), (points[:, 2] < -1.6).tolist(), strict=True)} == {
-            (255, False),
-            (1, True),
-        }
+        of_points = zip(frame.labels(("background", "road")).tolist(), (points[:, 2] < -1.6).tolist(), strict=True)
+        assert {*of_points} == {(255, False), (1, True)}
     assert ScanFolder(tmp_path / "v1.0-mini", "nuscenes").drives == folder.drives
 
 
@@ -195,6 +188,9 @@ def test_argoverse2_is_read_from_its_logs(tmp_path: Path, streets: list[tuple[np
         np.testing.assert_allclose(frame.points[:, 3], points[:, 3], atol=1.01 / 255)
     (area,) = folder.frame(f"7fab_{10**18}").drivable or ()
     np.testing.assert_allclose(area + EGO_M, [(0, -3, 0), (30, -3, 0), (30, 4, 0)], atol=1e-6)
+    folder.scans[f"7fab_{10**18}"].unlink()
+    with pytest.warns(UserWarning, match="of 2 labeled scans 1 are there, and not .*/val/7fab/sensors"):
+        ScanFolder(tmp_path, "av2")
 
 
 @pytest.mark.parametrize(("of", "layout"), [(nuscenes, "nuscenes"), (argoverse2, "av2")])
@@ -227,11 +223,8 @@ def changed(table: str, rows: Any) -> Callable[[Path], None]:
     return change
 
 
-def replaced(path: Path, *pairs: tuple[str, str]) -> None:
-    text = path.read_text()
-    for before, after in pairs:
-        text = text.replace(before, after)
-    path.write_text(text)
+def replaced(path: Path, before: str, after: str) -> None:
+    path.write_text(path.read_text().replace(before, after))
 
 
 def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
@@ -241,15 +234,15 @@ def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tupl
     tables = (tmp_path / "v1.0-mini").rename(tmp_path / "train_data")
     (tmp_path / "samples").rename(tmp_path / "train_samples")
     (tables / "lidarseg.json").unlink()
-    replaced(tables / "sensor.json", ("LIDAR_TOP", "LIDAR_CONCAT"), ("camera", "lidar"))
-    replaced(tables / "sample_data.json", ("on-c", "none"))
-    replaced(tables / "category.json", ('"index": 17', '"index": null'))
+    replaced(tables / "sensor.json", "LIDAR_TOP", "LIDAR_CONCAT")
+    replaced(tables / "sensor.json", "camera", "lidar")
+    replaced(tables / "sample_data.json", "on-c", "none")
+    replaced(tables / "category.json", '"index": 17', '"index": null')
     layout = replace(folder.layout, boxes={"vehicle.bicycle": "cyclist", "*": "car"})
     (frame,) = map((other := ScanFolder(tables, layout)).frame, other.drives)
     np.testing.assert_array_equal(frame.points, expected.points)
-    assert frame.boxes is not None
-    assert expected.boxes is not None
-    assert [box.label == "cyclist" for box in frame.boxes] == [box.label == "cyclist" for box in expected.boxes]
+    ridden, true = ([box.label == "cyclist" for box in each.boxes or ()] for each in (frame, expected))
+    assert ridden == true != []
 
 
 @pytest.mark.parametrize(
@@ -265,20 +258,9 @@ def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tupl
         (changed("sample_data", [{"token": 1}]), "row that is not nuScenes'"),
         (changed("ego_pose", []), "a row 'e0' that is not there"),
         (changed("scene", []), "sample.json has a row that is not nuScenes'"),
-        (
-            changed("sensor", [{"token": k, "channel": k, "modality": "lidar"} for k in "lc"]),
-            "LiDARs c, l; expected some of one",
-        ),
-        (
-            changed("category", [{"token": kind, "name": kind, "index": -1} for kind in SEEN.values()]),
-            "names by number",
-        ),
-        (
-            lambda root: replaced(
-                root / "v1.0-mini/sample_data.json", ("false", "true"), ("sweeps/LIDAR_TOP/", f"{FILE}")
-            ),
-            "two key frames are called n015__LIDAR_TOP__0; expected one",
-        ),
+        (changed("sensor", [{"token": k, "channel": k, "modality": "lidar"} for k in "lc"]), "LiDARs c, l; expected"),
+        (changed("category", [{"token": k, "name": k, "index": -1} for k in SEEN.values()]), "names by number"),
+        (lambda root: replaced(root / "v1.0-mini/sample_data.json", "false", "true"), "two key frames are called n015"),
     ],
 )
 def test_damaged_tables_are_refused(
@@ -303,14 +285,14 @@ def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: list[tuple[np.nd
         folder.frame("n015__LIDAR_TOP__1")
     (root / "lidarseg" / "1.bin").unlink()
     with (
-        pytest.warns(UserWarning, match=r"scans 1 are there"),
-        pytest.warns(UserWarning, match=r"json 0 are there, and not .*/lidarseg/1.bin"),
+        pytest.warns(match="scans 1 are"),
+        pytest.warns(match="json 0 are"),
         pytest.raises(PointsError, match="no labels"),
     ):
         ScanFolder(root, "nuscenes")
-    replaced(nuscenes(tmp_path / "unnamed", streets[:1]) / "v1.0-mini" / "category.json", ("index", "number"))
+    replaced(nuscenes(tmp_path / "unnamed", streets[:1]) / "v1.0-mini" / "category.json", "index", "number")
     with pytest.raises(PointsError, match=r"no name for 24; add it to category\.json"):
-        ScanFolder(tmp_path / "unnamed", "nuscenes").frame(f"{FILE}0")
+        ScanFolder(tmp_path / "unnamed", "nuscenes").frame("n015__LIDAR_TOP__0")
 
 
 @given(
@@ -351,10 +333,6 @@ def test_damaged_logs_are_refused(
     argoverse2(tmp_path / "small", [(streets[0][0], [replace(streets[0][1][0], label="none")])])
     with pytest.raises(PointsError, match="None in place of a text"):
         ScanFolder(tmp_path / "small", "av2").frame(name)  # labels that were changed are read again
-    argoverse2(tmp_path / "part", streets)
-    (tmp_path / "part/val/7fab/sensors/lidar" / f"{10**18}.feather").unlink()
-    with pytest.warns(UserWarning, match="of 2 labeled scans 1 are there, and not .*/val/7fab/sensors"):
-        ScanFolder(tmp_path / "part", "av2")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"edgeperc\[argoverse\]"):
         ScanFolder(root, "av2")
