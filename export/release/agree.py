@@ -25,7 +25,7 @@ from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.camvid import check_classes
 from edgeperc.evaluation.judge import Judge, Perceiving
 from edgeperc.evaluation.kitti_ap import FrontTruth, average_precisions, best_candidates, count_in_image, image_size_of
-from edgeperc.evaluation.metrics import Confusion, Listed
+from edgeperc.evaluation.metrics import Confusion, Listed, mean
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
 from edgeperc.inference.session import Session
@@ -201,7 +201,7 @@ def _measure(
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]
     ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
-    return Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, by)
+    return Measured(labels, mean(ious), ap[0] if ap else None, by)
 
 
 def _measure_objects(

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion, boxes_to_find
+from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion, boxes_to_find, mean
 from edgeperc.inference.decode import decode_top_view
 from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
@@ -57,7 +57,7 @@ class Tally:
 
     def decisive(self) -> float:
         """The figure that decides which weights are kept: AP of the boxes, else mean IoU without background."""
-        return float(np.nanmean(self.pixels.iou()[1:])) if self.boxes is None else self.boxes.overall().ap
+        return mean(self.pixels.iou()[1:]) if self.boxes is None else self.boxes.overall().ap
 
     def figures(self) -> dict[str, float | None]:
         """IoU of each class; AP, recall and share of right headings of the boxes. None where one is not defined."""

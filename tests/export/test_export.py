@@ -807,6 +807,7 @@ def test_an_empty_scan_is_a_sample_without_ground_truth(simulated: Path) -> None
     image, truth = samples.sample(replace(scan, points=scan.points[:0], labels=scan.labels[:0]))
     assert not image.any()
     assert (truth == IGNORE).all()
+    assert np.isnan(samples.task.tally().decisive())  # without a word
     full_image, full_truth = samples.sample(scan)
     empty = (full_image == 0.0).all(axis=0)
     assert (full_truth[empty] == IGNORE).all()

@@ -17,8 +17,8 @@ def add_parser(commands: Commands) -> None:
         eval_sensors_command,
         help="accuracy on sensors that the model was not trained on",
         description="IoU of points by class on labeled scans of sensors that the model was not trained on: without "
-        "adaptation, with the remission mapped, with interpolation between beams, and with both. Of labeled scans with "
-        "boxes also the average precision of boxes of the default models, as KITTI and nuScenes measure it.",
+        "adaptation, with the remission mapped, with interpolation between beams, and with both. In scans with boxes, "
+        "the class of a point is its box's, and the AP of boxes is printed too, as KITTI and nuScenes measure it.",
         examples=[
             "edgeperc eval-sensors os1-64=simulation:24",
             "edgeperc eval-sensors PandaSet/:pandaset vlp-16=simulation:8 --json out.json",
