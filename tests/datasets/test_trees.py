@@ -25,6 +25,7 @@ from edgeperc.simulation.scene import simulate
 from edgeperc.types.perception import Box
 from strategies import JSON
 
+Streets = list[tuple[np.ndarray, list[Box]]]
 RIGHT = math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5)  # w, x, y, z of a quarter turn to the right
 SEEN = {"car": "vehicle.car", "pedestrian": "human.pedestrian.adult", "cyclist": "vehicle.bicycle"}
 AV2 = {"car": "REGULAR_VEHICLE", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLIST"}
@@ -48,7 +49,7 @@ def about_z(angle: float) -> tuple[float, float, float, float]:
 
 
 @pytest.fixture(scope="module")
-def streets() -> list[tuple[np.ndarray, list[Box]]]:
+def streets() -> Streets:
     """Scans with x ahead and the boxes of their vehicles and people."""
     scans = [simulate(random_scene(seed), "hdl-32e", seed=seed) for seed in (3, 4)]
     return [(scan.points, [box for box in scan.boxes if box.label in SEEN]) for scan in scans]
@@ -68,7 +69,7 @@ class Vehicle:
         return self.place + rotated(self.turn, in_vehicle), product(self.turn, about_z(box.yaw))
 
 
-def nuscenes(root: Path, streets: list[tuple[np.ndarray, list[Box]]], **changes: list[dict[str, Any]]) -> Path:
+def nuscenes(root: Path, streets: Streets, **changes: list[dict[str, Any]]) -> Path:
     """A set of nuScenes: x of the LiDAR is to the right, a bicycle has a rider, and a camera and a sweep are beside."""
     kinds = [*SEEN.values()]
     tables: dict[str, list[dict[str, Any]]] = {
@@ -118,7 +119,7 @@ def nuscenes(root: Path, streets: list[tuple[np.ndarray, list[Box]]], **changes:
     return root
 
 
-def argoverse2(root: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> Path:
+def argoverse2(root: Path, streets: Streets) -> Path:
     """A log of Argoverse 2, with a sweep that nobody labeled."""
     feather = pytest.importorskip("pyarrow.feather")
     pyarrow = pytest.importorskip("pyarrow")
@@ -166,7 +167,7 @@ def check(frame: ScanFrame, points: np.ndarray, boxes: list[Box], within_m: floa
         assert math.cos(box.yaw - true.yaw) > 1.0 - 1e-6
 
 
-def test_nuscenes_is_read_from_its_tables(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
+def test_nuscenes_is_read_from_its_tables(tmp_path: Path, streets: Streets) -> None:
     folder = ScanFolder.parse(f"{nuscenes(tmp_path, streets)}:nuscenes")
     assert folder.drives == {f"n015__LIDAR_TOP__{k}": "scene-0061" for k in range(2)}
     assert any(box.label == "cyclist" for _, boxes in streets for box in boxes)
@@ -179,7 +180,7 @@ def test_nuscenes_is_read_from_its_tables(tmp_path: Path, streets: list[tuple[np
     assert ScanFolder(tmp_path / "v1.0-mini", "nuscenes").drives == folder.drives
 
 
-def test_argoverse2_is_read_from_its_logs(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
+def test_argoverse2_is_read_from_its_logs(tmp_path: Path, streets: Streets) -> None:
     folder = ScanFolder.parse(f"{argoverse2(tmp_path, streets)}:av2")
     assert folder.drives == {f"7fab_{10**18 + k}": "7fab" for k in range(2)}
     for k, (points, boxes) in enumerate(streets):
@@ -195,13 +196,12 @@ def test_argoverse2_is_read_from_its_logs(tmp_path: Path, streets: list[tuple[np
 
 @pytest.mark.parametrize(("of", "layout"), [(nuscenes, "nuscenes"), (argoverse2, "av2")])
 def test_it_is_evaluated_as_it_is(
-    of: Callable[..., Path], layout: str, tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]], shell: Shell
+    of: Callable[..., Path], layout: str, tmp_path: Path, streets: Streets, shell: Shell
 ) -> None:
     root = of(tmp_path, streets)
     said = shell.out("eval", f"{root}:{layout}", "--json", tmp_path / "figures.json")
     assert "vehicle" in said
-    written = json.loads((tmp_path / "figures.json").read_text())
-    assert str(written).count(layout)
+    assert layout in (tmp_path / "figures.json").read_text()
 
 
 def test_files_in_the_plain_layout_are_read_with_the_same_name(tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def replaced(path: Path, before: str, after: str) -> None:
     path.write_text(path.read_text().replace(before, after))
 
 
-def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
+def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: Streets) -> None:
     """T4 lists LiDARs without scans, and classes without a number; Lyft's scans on Kaggle lie in train_lidar."""
     folder = ScanFolder(nuscenes(tmp_path, streets[:1]), "nuscenes")
     (expected,) = map(folder.frame, folder.drives)
@@ -263,15 +263,13 @@ def test_other_sets_with_such_tables_are_read(tmp_path: Path, streets: list[tupl
         (lambda root: replaced(root / "v1.0-mini/sample_data.json", "false", "true"), "two key frames are called n015"),
     ],
 )
-def test_damaged_tables_are_refused(
-    change: Callable[[Path], None], said: str, tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]
-) -> None:
+def test_damaged_tables_are_refused(change: Callable[[Path], Any], said: str, tmp_path: Path, streets: Streets) -> None:
     change(nuscenes(tmp_path, streets[:1]))
     with pytest.raises(PointsError, match=said):
         ScanFolder(tmp_path, "nuscenes")
 
 
-def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]]) -> None:
+def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: Streets) -> None:
     """Whole sets are downloaded in parts; without boxes, points alone are labeled, and without both nothing is."""
     root = nuscenes(tmp_path, streets, sample_annotation=[])
     (root / "samples" / "LIDAR_TOP" / "n015__LIDAR_TOP__0.pcd.bin").unlink()
@@ -284,11 +282,7 @@ def test_a_part_of_the_files_is_enough(tmp_path: Path, streets: list[tuple[np.nd
     with pytest.raises(PointsError, match="3 labels for a scan of"):
         folder.frame("n015__LIDAR_TOP__1")
     (root / "lidarseg" / "1.bin").unlink()
-    with (
-        pytest.warns(match="scans 1 are"),
-        pytest.warns(match="json 0 are"),
-        pytest.raises(PointsError, match="no labels"),
-    ):
+    with pytest.warns(UserWarning, match="are there"), pytest.raises(PointsError, match="has no labels"):
         ScanFolder(root, "nuscenes")
     replaced(nuscenes(tmp_path / "unnamed", streets[:1]) / "v1.0-mini" / "category.json", "index", "number")
     with pytest.raises(PointsError, match=r"no name for 24; add it to category\.json"):
@@ -316,9 +310,7 @@ def test_any_table_is_read_or_refused(
             folder.frame(name)
 
 
-def test_damaged_logs_are_refused(
-    tmp_path: Path, streets: list[tuple[np.ndarray, list[Box]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_logs_are_refused(tmp_path: Path, streets: Streets, monkeypatch: pytest.MonkeyPatch) -> None:
     root = argoverse2(tmp_path, streets[:1])
     folder, name = ScanFolder(root, "av2"), f"7fab_{10**18}"
     sweep = root / "val" / "7fab" / "sensors" / "lidar" / f"{10**18}.feather"
