@@ -113,6 +113,8 @@ def test_of_a_scan_that_came_twice_what_could_move_goes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("url", ["", "memory:/"])
 def test_the_ring_of_nuscenes_files_stays(tmp_path: Path, url: str, values: int) -> None:
     """With the coordinates of the scan, which has been straightened."""
+    if url:
+        pytest.importorskip("fsspec")
     source, rings = location(f"{url}{tmp_path}/sweep.pcd.bin"), np.arange(len(POINTS), dtype=np.float32)
     columns = np.column_stack([POINTS + np.float32([0.5, 0.0, 0.0, 0.0]), rings, rings])[:, :values]
     source.write_bytes(columns.tobytes())
