@@ -95,6 +95,7 @@ test-minimal: LOADING = bench cli datasets readers ros2 sinks system view
 test-minimal: ALIKE = cli/test_cli_info cli/test_programs readers/test_alternation readers/test_identify
 test-minimal: ALIKE += readers/test_livox_packets readers/test_mems_packets readers/test_mirror_packets readers/test_pcap
 test-minimal: ALIKE += readers/test_ports readers/test_spinning_packets readers/test_origin readers/test_times
+test-minimal: ALIKE += readers/test_files readers/test_packets datasets/test_trees
 test-minimal: ALIKE += sinks/test_run_file system/test_atomic system/test_clock
 test-minimal: ALIKE += system/test_compilation system/test_fields system/test_interpreter system/test_kernel_cache
 test-minimal: ALIKE += system/test_kernels system/test_lanes system/test_machine system/test_pool
