@@ -91,13 +91,13 @@ def file_name(scan: str) -> str:
 def _content(xyz: NDArray[Any], remission: Floats32, kept: Mask, source: str) -> bytes:
     """The file of the points that are kept; their coordinates have the type of ``xyz``."""
     suffix = stem_of(source)[1]
-    rows = np.column_stack([xyz, remission])
+    others = remission[:, None]
     if suffix == ".pcd.bin":  # a scan that was straightened has other coordinates than its file
         whole = np.frombuffer(location(source).read_bytes(), np.uint8)
         if whole.size % (4 * len(xyz) or np.inf):
             raise PointsError(f"{source} holds {whole.size:,} bytes for {len(xyz):,} points; expected as many for each")
-        rows = np.column_stack([xyz, whole.view("<f4").reshape(len(xyz), -1)[:, 3:]])
-    rows = rows[kept]
+        others = whole.view("<f4").reshape(len(xyz), -1)[:, 3:]
+    rows = np.column_stack([xyz, others])[kept]
     if suffix in (".npy", ".npz"):
         file = io.BytesIO()
         np.save(file, rows) if suffix == ".npy" else np.savez(file, points=rows)
