@@ -118,14 +118,14 @@ test-ahead: .venv-test/installed
 # Green with a new numba: raise the bound.
 test-newest: pyproject.toml
 	$(call environment,.venv-newest)
-	$(NEWEST)/pip install --quiet --editable '.[cpu]' filelock hypothesis pytest pytest-xdist
+	.ci/install .venv-newest --editable '.[cpu]' filelock hypothesis pytest pytest-xdist
 	$(NEWEST)/pip install --quiet --upgrade numba numpy
 	$(NEWEST)/pytest -n $(JOBS) --dist worksteal -m kernel
 	$(NEWEST)/pytest -n $(JOBS) --dist worksteal tests/system/test_kernel_cache.py tests/test_warm_up.py
 
 test-extra: pyproject.toml
 	$(call environment,.venv-extra)
-	$(ALONE)/pip install --quiet --editable '.[$(EXTRA)]' filelock hypothesis pytest pytest-xdist
+	.ci/install .venv-extra --editable '.[$(EXTRA)]' filelock hypothesis pytest pytest-xdist
 	$(ALONE)/pip check
 	$(ALONE)/python tests/smoke.py $(EXTRA)
 
@@ -142,21 +142,19 @@ release sbom:
 	PYTHON=$(PYTHON) bash .ci/release
 
 # The stamp inside each environment is as new as what it was installed from, so a second `make` installs nothing.
-# Of the tests' packages, only what is imported is compiled, by the first import: 82 in place of 153 s to install them.
 .venv/installed: pyproject.toml
 	$(call environment,.venv)
-	$(BIN)/pip install --quiet --editable '.[cpu,view]'
+	.ci/install .venv --editable '.[cpu,view]'
 	@touch $@
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	$(TEST)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,ray,slam,tensorboard,docs,test]'
+	.ci/install .venv-test --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,ray,slam,tensorboard,docs,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-minimal)
-	$(MINIMAL)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[cpu]' \
-		filelock hypothesis pytest pytest-xdist shapely
+	.ci/install .venv-minimal --constraint constraints.txt --editable '.[cpu]' filelock hypothesis pytest pytest-xdist shapely
 	@touch $@
 
 # uv finds the lowest versions; pip finds the highest alone.
