@@ -107,7 +107,7 @@ FLOORS = {
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.painting
         evaluation.tracking_metrics
         evaluation.ab3dmot evaluation.causes evaluation.center_ap evaluation.headings evaluation.kitti_ap
-        evaluation.tables
+        evaluation.predictions evaluation.tables
         evaluation.truth
         evaluation.judge
         evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer

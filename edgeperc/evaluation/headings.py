@@ -7,7 +7,7 @@ which the tracker estimates.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -31,20 +31,36 @@ COUNTS = (
 )
 
 
-def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats]:
-    """Speed over ground of each true box by frame [m/s], from places up to `WINDOW` frames away; NaN without others."""
-    places: list[dict[int, Floats]] = []
+def places(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[dict[int, Floats]]:
+    """x, y [m] of the true boxes in the frame of `Tracks.T_world_sensor`, by frame and id."""
+    found = []
     for frame, result in zip(truth, tracks, strict=True):
         world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
-        places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
-    speeds_mps = []
-    for k, here in enumerate(places):
+        found.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
+    return found
+
+
+def matches(
+    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
+) -> Iterator[tuple[int, int, int]]:
+    """Frame, true box that is not ignored, and the track of ``labels`` with the largest 3-D IoU, if large enough."""
+    for k, (frame, result) in enumerate(zip(truth, tracks, strict=True)):
+        mine = np.flatnonzero([label in labels for label in result.labels])
+        iou = box_iou(frame.boxes, result.boxes[mine])
+        for i in np.flatnonzero(~frame.ignored).tolist():
+            if iou[i].max(initial=0.0) >= iou_threshold:
+                yield k, i, int(mine[iou[i].argmax()])
+
+
+def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats]:
+    """Speed over ground of each true box by frame [m/s], from places up to `WINDOW` frames away; NaN without others."""
+    at, speeds_mps = places(truth, tracks), []
+    for k, here in enumerate(at):
         speed = np.full(len(truth[k].ids), np.nan)
         for i, one in enumerate(here):
-            near = [j for j in range(max(k - WINDOW, 0), min(k + WINDOW + 1, len(places))) if one in places[j]]
+            near = [j for j in range(max(k - WINDOW, 0), min(k + WINDOW + 1, len(at))) if one in at[j]]
             if near[-1] > near[0]:
-                way = places[near[-1]][one] - places[near[0]][one]
-                speed[i] = np.hypot(*way) / (FRAME_S * (near[-1] - near[0]))
+                speed[i] = np.hypot(*(at[near[-1]][one] - at[near[0]][one])) / (FRAME_S * (near[-1] - near[0]))
         speeds_mps.append(speed)
     return speeds_mps
 
@@ -54,22 +70,20 @@ def count_headings(
 ) -> dict[str, Counter[str]]:
     """`COUNTS` of one sequence by `MOTIONS`, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
     counted = {motion: Counter(dict.fromkeys(COUNTS, 0)) for motion in MOTIONS}
-    moved: set[int] = set()
-    met: set[tuple[str, int]] = set()
-    for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
-        mine = np.flatnonzero([label in labels for label in result.labels])
-        iou = box_iou(frame.boxes, result.boxes[mine])
-        moves = speed > MOVING_MPS
-        moved |= {*frame.ids[moves].tolist()}
-        for i in np.flatnonzero(~frame.ignored & ~np.isnan(speed)).tolist():
-            if iou[i].max(initial=0.0) < iou_threshold:
-                continue
-            track = mine[int(iou[i].argmax())]
-            right = int(np.cos(result.boxes[track, 6] - frame.boxes[i, 6]) > 0.0)
-            resolved = int(result.fronts[track] >= 0.5)
-            motion = "moving" if moves[i] else "stopped" if int(frame.ids[i]) in moved else "parked"
-            met.add((motion, int(result.ids[track])))
-            counted[motion].update(n_boxes=1, n_resolved=resolved, n_right=resolved * right, n_right_of_all=right)
+    speeds_mps, met = speeds(truth, tracks), set()
+    first = {}  # frame in which an object moves first
+    for k in reversed(range(len(truth))):
+        first.update(dict.fromkeys(truth[k].ids[speeds_mps[k] > MOVING_MPS].tolist(), k))
+    for k, i, track in matches(truth, tracks, labels, iou_threshold):
+        speed, tracked = speeds_mps[k][i], tracks[k]
+        if np.isnan(speed):
+            continue
+        right = int(np.cos(tracked.boxes[track, 6] - truth[k].boxes[i, 6]) > 0.0)
+        resolved = int(tracked.fronts[track] >= 0.5)
+        stopped = first.get(int(truth[k].ids[i]), k + 1) <= k
+        motion = "moving" if speed > MOVING_MPS else "stopped" if stopped else "parked"
+        met.add((motion, int(tracked.ids[track])))
+        counted[motion].update(n_boxes=1, n_resolved=resolved, n_right=resolved * right, n_right_of_all=right)
     for motion, _ in met:
         counted[motion]["n_tracks"] += 1
     return counted

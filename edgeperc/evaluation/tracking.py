@@ -28,6 +28,7 @@ from .ab3dmot import SETTINGS, Ab3dmot
 from .headings import FRAME_S, count_headings
 from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
+from .predictions import count_predictions
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 
 __all__ = ["CLASSES", "KINDS", "RULES", "evaluate_kitti"]
@@ -331,8 +332,9 @@ def evaluate_kitti(
     -------
     dict
         For JSON: ``sequences``, ``iou_threshold``, ``rules``, ``frames_per_s``; in ``classes`` the `TrackingScores` of
-        each; in ``headings`` the counts of `edgeperc.evaluation.headings` of each; with ``rival``, in ``rival`` the
-        `TrackingScores` of AB3DMOT's method.
+        each; in ``headings`` and ``predictions`` the counts of `edgeperc.evaluation.headings` and
+        `edgeperc.evaluation.predictions` of each; with ``rival``, in ``rival`` the `TrackingScores` of AB3DMOT's
+        method.
 
     Raises
     ------
@@ -349,6 +351,7 @@ def evaluate_kitti(
     # By tracker and class, of each sequence.
     pairs: dict[tuple[str, str], list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {}
     headings: dict[str, dict[str, Counter[str]]] = {label: {} for label in classes}
+    predictions: dict[str, dict[str, Counter[str]]] = {label: {} for label in classes}
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
         sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
@@ -364,9 +367,10 @@ def evaluate_kitti(
             for method, reported in results.items():
                 pair = true, _frame_tracks(sequence, reported, label, rules)
                 pairs.setdefault((method, label), []).append(pair)
-            counted = count_headings(sequence.truth[label], tracks, KINDS[label], iou_threshold)
-            for motion, counts in counted.items():
-                headings[label].setdefault(motion, Counter()).update(counts)
+            for counters, count in ((headings, count_headings), (predictions, count_predictions)):
+                counted = count(sequence.truth[label], tracks, KINDS[label], iou_threshold)
+                for name_of, counts in counted.items():
+                    counters[label].setdefault(name_of, Counter()).update(counts)
         if on_sequence is not None:
             on_sequence(done, len(names))
     scores: dict[str, dict[str, Any]] = {"edgeperc": {}, "ab3dmot": {}}
@@ -379,6 +383,7 @@ def evaluate_kitti(
         "frames_per_s": n_frames / seconds,
         "classes": scores["edgeperc"],
         "headings": headings,
+        "predictions": predictions,
         **({"rival": scores["ab3dmot"]} if rival else {}),
     }
 

@@ -374,18 +374,16 @@ class RosMessages:
         return self._objects("Tracked", scan, stamp_ns, objects)
 
     def predicted_objects(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
-        """Tracks, each with one path of 5 s straight on: an autoware_perception_msgs/PredictedObjects.
+        """Tracks, each with one path of 5 s, an arc: an autoware_perception_msgs/PredictedObjects.
 
-        The path is that of the track's velocity over ground, as seen from where the sensor was at the scan.
+        The path is over ground (`Track.predicted`), as seen from where the sensor was at the scan.
         """
         step = self._duration(_PATH_STEP_S)
         objects = []
         for track in scan.tracked or ():
-            way = _velocity(scan, track) * _PATH_STEP_S
-            places = [np.add(track.box.center, k * way).tolist() for k in range(_PATH_STEPS + 1)]
             path = self._make(
                 "autoware_perception_msgs/msg/PredictedPath",
-                path=[self._pose(replace(track.box, center=tuple(place))) for place in places],
+                path=[self._pose(track.predicted(k * _PATH_STEP_S)) for k in range(_PATH_STEPS + 1)],
                 time_step=step,
                 confidence=1.0,
             )

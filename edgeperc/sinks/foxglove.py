@@ -167,8 +167,8 @@ class _Channels:
         make, entities, trails = self._messages, [], self._trails.update(scan.tracks)
         for track in scan.tracks:
             box, color = track.world_box, self._color(track.label, 1.0)
-            dx, dy, _ = track.world_velocity
-            speed = math.hypot(dx, dy)
+            dx, dy, _ = np.subtract(track.predicted(1.0, world=True).center, box.center).tolist()
+            gone = math.hypot(dx, dy)
             lines = [self._line("LineList", box_corners(box)[np.ravel(EDGES)], color)]
             lines.append(self._line("LineStrip", trails[track.id], color))
             ahead = self._pose(box.center, math.atan2(dy, dx))
@@ -180,7 +180,7 @@ class _Channels:
                     label=printable(track.label), score=f"{track.score:.4f}", coasting=str(track.coasting).lower()
                 ),
                 lines=lines,
-                arrows=[self._arrow(ahead, speed, color)] if speed > 0.5 else [],  # to where it is in a second
+                arrows=[self._arrow(ahead, gone, color)] if gone > 0.5 else [],  # to where it is in a second
                 texts=[self._text(box, track_text(track), color)],
             )
             entities.append(entity)

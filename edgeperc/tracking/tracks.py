@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, overload
 
 import numpy as np
@@ -110,6 +110,7 @@ PARAMETERS: Mapping[str, ClassParameters] = {
     "pedestrian": _PEDESTRIAN,
     "cyclist": _CYCLIST,
 }
+AHEAD_S = (1.0, 2.0, 3.0)  # for which records and evaluations hold where a track will be
 DOUBT = 10.0  # scans with log odds 0 that are added to the mean in a track's score
 
 
@@ -147,6 +148,8 @@ class Track:
         Number of scans in which it was detected.
     coasting : bool
         Whether it was not detected in this scan.
+    T_world_sensor : (4, 4) float64
+        Pose of the sensor at this scan, as in `Tracks`.
     """
 
     id: int
@@ -161,11 +164,45 @@ class Track:
     age_s: float
     hits: int
     coasting: bool
+    T_world_sensor: Floats
 
     @property
     def world_velocity(self) -> Floats:
         """Velocity over ground along x, y, z of the frame of ``world_box``, (3,) float64 [m/s]."""
         return float(self.state[2]) * np.array([math.cos(self.state[3]), math.sin(self.state[3]), 0.0])
+
+    def predicted(self, ahead_s: float, *, world: bool = False) -> Box:
+        """Predict the box after a time, if the object keeps its speed and its turn rate (CTRV, KUL-Seg section 6).
+
+        Parameters
+        ----------
+        ahead_s : float
+            Time after this scan [s], in 0..60.
+        world : bool
+            False: in the sensor frame of this scan, as ``box``. True: in the frame of ``world_box``.
+
+        Returns
+        -------
+        Box
+            With the size, label, score and front of the track. It drives on an arc in the plane of the world's x and y.
+
+        Raises
+        ------
+        OptionError
+            ``ahead_s`` is no such number.
+        """
+        OPTIONS.number("ahead_s", ahead_s, 0.0, 60.0)
+        _, _, speed, heading, turn_rate = self.state.tolist()
+        turn = turn_rate * ahead_s
+        chord_m, along = speed * ahead_s * float(np.sinc(turn / math.tau)), heading + turn / 2.0
+        shift = np.array([chord_m * math.cos(along), chord_m * math.sin(along), 0.0])
+        yaw = wrapped(self.world_box.yaw + turn)
+        if world:
+            return replace(self.world_box, center=(*np.add(self.world_box.center, shift).tolist(),), yaw=float(yaw))
+        R = self.T_world_sensor[:3, :3]
+        ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0]) @ R
+        center = np.add(self.box.center, shift @ R)
+        return replace(self.box, center=(*center.tolist(),), yaw=math.atan2(ahead[1], ahead[0]))
 
     @property
     def center(self) -> tuple[float, float, float]:
@@ -183,7 +220,9 @@ class Track:
         return self.box.yaw
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to a dict for JSON: the entries of `Box.to_dict`, and those of the track."""
+        """Convert to a dict for JSON: the entries of `Box.to_dict`, and those of the track; ``predicted`` holds x, y, z
+        and yaw in 1, 2 and 3 s.
+        """
         return {
             "id": self.id,
             **self.box.to_dict(),
@@ -192,6 +231,7 @@ class Track:
             "hits": self.hits,
             "coasting": self.coasting,
             "modes": {name: round(share, 4) for name, share in self.modes.items()},
+            "predicted": [[*box["center"], box["yaw"]] for box in (self.predicted(s).to_dict() for s in AHEAD_S)],
         }
 
 
@@ -294,6 +334,7 @@ class Tracks(Sequence[Track]):
             age_s=float(row["age_s"]),
             hits=int(row["hits"]),
             coasting=bool(row["misses"] > 0),
+            T_world_sensor=self.T_world_sensor,
         )
 
 

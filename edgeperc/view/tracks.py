@@ -6,7 +6,6 @@ import io
 import math
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from ..system.extras import require
 from ..system.names import check_picture
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.perception import Perception
+from ..types.perception import Box, Perception
 from ..types.points import Bytes, Floats, Points
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, SCENE_COLORS, color_of, rgb
@@ -39,6 +38,7 @@ _WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
 _ROAD, _POINT, _CLASS = 1, 2, 5
 _COLORED = (*SCENE_COLORS, *CLASS_COLORS)  # objects over the surroundings; others over both
 _OTHER, _DRIVABLE = _CLASS + len(_COLORED), _CLASS + _COLORED.index("drivable")
+_AHEAD_S = (0.0, 0.25, 0.5, 0.75, 1.0)
 AT_ONCE = 50  # pictures in memory: 0.8 MB each, which are 2.3 GB of five minutes
 
 
@@ -185,17 +185,14 @@ def _pictures(
             trails[track.id] = [place for place in trail if place[3] > begin_s]
         R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
         frame = ModelFrame(mountings[k] if mountings else MODEL_MOUNTING)
-        drawn = [_as_the_vehicle_sees(track, frame) for track in tracks if drawable_boxes([track.box])]
+        drawn = [track for track in tracks if drawable_boxes([track.box])]
         for track in drawn:
-            _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R @ frame.R.T + frame.t)
-        _write_names(pen, drawn, fonts[14])
+            trail = (np.array(trails[track.id])[:, :3] - t) @ R @ frame.R.T + frame.t
+            _draw_track(pen, track, trail, frame.move_boxes([track.predicted(s) for s in _AHEAD_S]))
+        _write_names(pen, drawn, frame, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
         _write_frame(pen, title, facts, labels, fonts, tail_s)
         yield picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE)
-
-
-def _as_the_vehicle_sees(track: Track, frame: ModelFrame) -> Track:
-    return replace(track, box=frame.move_boxes([track.box])[0], velocity=frame.R[:2, :2] @ track.velocity)
 
 
 def _layer_colors() -> Bytes:
@@ -238,24 +235,24 @@ def _draw_rings(pen: Any, font: Any) -> None:
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
 
 
-def _draw_track(pen: Any, track: Track, trail: Floats) -> None:
+def _draw_track(pen: Any, track: Track, trail: Floats, ahead: Sequence[Box]) -> None:
+    """Draw the box, the trail, and an arrow to where it is in a second; ``ahead`` are the boxes of `_AHEAD_S`."""
     color = color_of(track.label)
     if len(trail) > 1:
         pen.line(_pixels(trail), fill=color, width=_FINE + 1, joint="curve")
-    pen.polygon(_pixels(track.box.corners()), outline=color, width=(1 if track.coasting else 2) * _FINE)
+    pen.polygon(_pixels(ahead[0].corners()), outline=color, width=(1 if track.coasting else 2) * _FINE)
     speed = math.hypot(*track.velocity)
     if speed > 0.5:
-        start = np.array(track.box.center[:2])
-        along = np.asarray(track.velocity) / speed
-        tip, neck = start + track.velocity, start + along * max(0.0, speed - 1.2)
-        side = 0.6 * np.array([-along[1], along[0]])
-        pen.line(_pixels(np.array([start, neck])), fill=INK, width=2 * _FINE)
+        way = np.array([box.center[:2] for box in ahead])
+        along = (way[-1] - way[-2]) / math.hypot(*(way[-1] - way[-2]))
+        tip, neck, side = way[-1], way[-1] - along * min(1.2, speed), 0.6 * np.array([-along[1], along[0]])
+        pen.line(_pixels(np.array([*way[:-1], neck])), fill=INK, width=2 * _FINE, joint="curve")
         pen.polygon(_pixels(np.array([tip, neck + side, neck - side])), fill=INK)
 
 
-def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
+def _write_names(pen: Any, tracks: Sequence[Track], frame: ModelFrame, font: Any) -> None:
     """Write ids and speeds; no text covers a box or another text."""
-    areas = [np.array(_pixels(track.box.corners())) for track in tracks]
+    areas = [np.array(_pixels(box.corners())) for box in frame.move_boxes([track.box for track in tracks])]
     panel = (0.0, float(_FINE * _HEAD), float(_FINE * _WIDTH), float(_FINE * (_HEAD + _HEIGHT)))
     taken = [(*area.min(axis=0).tolist(), *area.max(axis=0).tolist()) for area in areas]
     for track, area in zip(tracks, list(taken), strict=True):

@@ -184,6 +184,8 @@ def test_headings_and_the_rival_are_printed(kitti: Path, shell: Shell) -> None:
     (moving,) = [row for row in rows if row[:2] == ["moving", "car"]]
     assert moving[2:4] == ["20", "1"]
     assert int(moving[4]) >= 10
+    (ahead,) = [row for row in rows if row[:3] == ["car", "1", "s"]]
+    assert (ahead[3:5], float(ahead[5]) < 2.0) == (["10", "1"], True)  # of 5 m/s, which it knows after a while
     assert moving[5:] == ["100.0", "100.0"]
 
 

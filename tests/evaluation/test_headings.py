@@ -1,4 +1,4 @@
-"""Headings of tracks against labels, by hand."""
+"""Headings and predicted places of tracks against labels, by hand."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 
 from edgeperc import Tracker
 from edgeperc.evaluation.headings import COUNTS, MOTIONS, count_headings, speeds
+from edgeperc.evaluation.predictions import count_predictions
 from edgeperc.evaluation.tracking_metrics import FrameTruth
 from scenes import box
 
@@ -46,6 +47,31 @@ def test_headings_by_hand() -> None:
     assert stopped["n_right"] == stopped["n_resolved"] == 6
     assert (parked["n_resolved"], parked["n_right_of_all"]) == (0, 0)
     assert count_headings(truth, tracks, ("van",), 0.25) == NONE
+
+
+def test_predictions_by_hand() -> None:
+    """One car drives on a circle, others stand; the vehicle drives, too, with poses and without."""
+    for posed in (True, False):
+        tracker, truth, tracks = Tracker(), [], []
+        for k in range(60):
+            turn, pose = 0.03 * k, np.eye(4)
+            pose[0, 3] = 0.5 * k
+            turning = (20.0 + 30.0 * math.sin(turn) - 0.5 * k, 30.0 * (1.0 - math.cos(turn)))
+            standing = [(20.0 + 6.0 * j - 0.5 * k, -8.0) for j in range(5)]
+            frame = truth_of([turning, *standing])
+            frame.boxes[0, 6] = turn
+            truth.append(frame)
+            boxes = [car(*turning, yaw=turn), *(car(*place) for place in standing)]
+            tracks.append(tracker.update(boxes, 0.1 * k, pose if posed else None))
+        counted = count_predictions(truth[15:], tracks[15:], ("car",), 0.25)  # its turn rate is known
+        assert [*counted] == ["1 s", "2 s", "3 s"]
+        for name, of in counted.items():
+            ahead_s = int(name[0])
+            assert (of["n_objects"], of["n_predictions"]) == (1, 45 - 10 * ahead_s)
+            assert of["straight_mm"] / of["n_predictions"] == pytest.approx(500.0 * 9.0 * 0.3 * ahead_s**2, rel=0.1)
+            assert of["error_mm"] < 0.2 * of["straight_mm"]
+    assert count_predictions(truth, tracks, ("van",), 0.25)["1 s"]["n_predictions"] == 0
+    assert count_predictions([], [], ("car",), 0.25)["3 s"]["n_objects"] == 0
 
 
 def test_ignored_lonely_and_missed_objects_do_not_count() -> None:

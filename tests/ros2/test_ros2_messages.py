@@ -298,8 +298,8 @@ def test_objects_of_autoware() -> None:
         assert bytes(each.object_id.uuid) == bytes(path.object_id.uuid)
         (way,) = path.kinematics.predicted_paths
         assert (way.confidence, way.time_step.sec, way.time_step.nanosec, len(way.path)) == (1.0, 0, 500_000_000, 11)
-        gone = np.subtract(position(way.path[10]), track.center)
-        np.testing.assert_allclose(gone, [*np.multiply(track.velocity, 5), 0], atol=1e-9)
+        for k, pose in enumerate(way.path):
+            np.testing.assert_allclose(position(pose), track.predicted(0.5 * k).center)
 
 
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(180.0, 0.0), (0.0, 30.0), (170.0, 20.0)])
@@ -320,8 +320,10 @@ def test_motion_seen_by_a_sensor_that_is_tilted_or_upside_down(roll_deg: float, 
     along = rotation(each.kinematics.pose_with_covariance.pose) @ [twist.linear.x, twist.linear.y, twist.linear.z]
     np.testing.assert_allclose(R @ along, 10.0 * ahead, atol=0.6)
     assert twist.angular.z == pytest.approx(turn_rps * R[2, 2], abs=0.06)
-    first, last = (np.array(position(path.kinematics.predicted_paths[0].path[k])) for k in (0, 10))
-    np.testing.assert_allclose(R @ (last - first), 50.0 * ahead, atol=3.0)
+    first, last = (np.array(position(path.kinematics.predicted_paths[0].path[k])) for k in (0, 6))
+    turned = heading + np.array([0.0, 3.0 * turn_rps])  # on an arc of 33 m
+    arc = 10.0 / turn_rps * np.array([*np.diff(np.sin(turned)), *-np.diff(np.cos(turned)), 0.0])
+    np.testing.assert_allclose(R @ (last - first), arc, atol=2.0)
     texts = [marker.text for marker in MESSAGES.markers(scan).markers if marker.ns == "track_labels"]
     assert float(texts[0].split()[2]) == pytest.approx(10.0, abs=0.3)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import pickle
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from edgeperc.tracking import lives
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.jpda import Detections
 from edgeperc.tracking.tracks import PARAMETERS
+from edgeperc.tracking.ukf import CTRV, move
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.perception import Perception
 from edgeperc_bench.peers.tracking import crossing
@@ -218,6 +220,40 @@ def test_the_score_grows_with_every_detection_and_shrinks_without() -> None:
     scores = [tracker.update([box("car", 10.0, 0.0, score=0.98)], 0.1 * k, STANDING)[0].score for k in range(10)]
     assert scores == sorted(scores)
     assert tracker.update([], 1.0, STANDING)[0].score < scores[-1]
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (180.0, 0.0), (10.0, 30.0)])
+@given(st.tuples(*(st.floats(-b, b) for b in (50.0, math.pi, 2.0))), st.floats(0.0, 5.0))
+def test_a_track_is_predicted_as_its_filter_does(
+    tilt: tuple[float, float], motion: tuple[float, float, float], ahead_s: float
+) -> None:
+    """On the arc of constant turn rate and velocity, in the world and as the sensor sees it."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = edgeperc.Mounting(None, *tilt).rotation(), (3.0, -2.0, 1.0)
+    (track,) = track_seen_from(tuple(map(tuple, pose)))
+    state = np.array([*track.world_box.center[:2], *motion])
+    track = replace(track, state=state.copy(), world_box=replace(track.world_box, yaw=motion[1] + math.pi))
+    move(CTRV, state, ahead_s)
+    predicted = track.predicted(ahead_s, world=True)
+    assert predicted.center == pytest.approx((*state[:2], track.world_box.center[2]), abs=1e-6)
+    assert math.cos(predicted.yaw - state[3] - math.pi) == pytest.approx(1.0)
+    assert (predicted.label, predicted.size, predicted.front) == ("car", track.box.size, track.box.front)
+    seen = track.predicted(ahead_s)
+    assert pose[:3, :3] @ seen.center + pose[:3, 3] == pytest.approx(predicted.center, abs=1e-6)
+    ahead = pose[:3, :3].T @ [math.cos(predicted.yaw), math.sin(predicted.yaw), 0.0]
+    assert seen.yaw == pytest.approx(math.atan2(ahead[1], ahead[0]))
+
+
+@functools.cache
+def track_seen_from(pose: tuple[tuple[float, ...], ...]) -> edgeperc.Tracks:
+    return Tracker().update([box("car", 10.0, 0.0, score=0.99)], 0.0, pose)
+
+
+@pytest.mark.parametrize("ahead_s", [-0.1, math.nan, math.inf, 61.0, "1", None])
+def test_a_time_that_is_none_is_refused(ahead_s: Any) -> None:
+    (track,) = track_seen_from(tuple(map(tuple, STANDING)))
+    with pytest.raises(OptionError, match="ahead_s"):
+        track.predicted(ahead_s)
 
 
 def test_a_box_seen_from_behind_is_the_same_box() -> None:

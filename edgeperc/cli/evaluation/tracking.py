@@ -174,6 +174,10 @@ _HEADING_COLUMNS = (
     *(("boxes", "n_boxes"), ("tracks", "n_tracks"), ("known front", "n_resolved"), ("right of known", "right")),
     ("right of all", "right_of_all"),
 )
+_PREDICTION_COLUMNS = (
+    *(("predictions", "n_predictions"), ("objects", "n_objects"), ("on their arc", "error_mm")),
+    ("straight on", "straight_mm"),
+)
 
 
 def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
@@ -190,6 +194,12 @@ def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
                 right = counts["n_right"] / counts["n_resolved"] if counts["n_resolved"] else None
                 shares = {"right": right, "right_of_all": counts["n_right_of_all"] / counts["n_boxes"]}
                 headings.append(((kind, name), counts | shares))
+    predictions = [
+        ((name, ahead), of | {key: f"{of[key] / of['n_predictions'] / 1e3:.2f}" for key in ("error_mm", "straight_mm")})
+        for name, by in figures["predictions"].items()
+        for ahead, of in by.items()
+        if of["n_predictions"]
+    ]
     return [
         f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}, rules "
         f"{figures['rules']}; {figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
@@ -197,4 +207,5 @@ def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
         *table_lines("counts at the best MOTA", _COUNT_COLUMNS, rows),
         *table_lines("counts of all tracks, with any score", _COUNT_COLUMNS, of_all),
         *table_lines("headings within a quarter turn of the label's", _HEADING_COLUMNS, headings),
+        *table_lines("from where a moving object is after a time, mean in m", _PREDICTION_COLUMNS, predictions),
     ]
