@@ -86,12 +86,10 @@ class Motion:
         first = rigid("T_world_first", T_world_first, TrackingError)
         second = rigid("T_world_second", T_world_second, TrackingError)
         first_s, second_s = as_seconds(first_s, "first_s"), as_seconds(second_s, "second_s")
-        if not 0.0 < second_s - first_s < math.inf:
-            raise StampError(f"got poses at {first_s} s and {second_s} s; expected a second one that is later")
-        if second_s - first_s > LONGEST_S:
+        if not 0.0 < second_s - first_s <= LONGEST_S:
             raise StampError(
-                f"got poses that are {second_s - first_s:g} s apart; expected at most {LONGEST_S:g} s: are the times "
-                "in another unit?"
+                f"got poses at {first_s} s and {second_s} s, {second_s - first_s:g} s apart; expected a second one "
+                f"that is later, by up to {LONGEST_S:g} s: are the times in another unit?"
             )
         return cls._of(first, second, second_s - first_s)
 
@@ -199,9 +197,10 @@ class Trajectory:
                 f"{path} cannot be read as poses ({exc}); expected lines of time, x, y, z, qx, qy, qz, qw"
             ) from exc
         norm = np.linalg.norm(rows[:, 4:], axis=1)
-        if not (np.abs(norm - 1.0) < 1e-2).all():
-            line = _line(content, int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))))
-            raise TrackingError(f"{path}: the quaternion of line {line} has not length 1")
+        is_right = (np.abs(norm - 1.0) < 1e-2) & np.isfinite(rows[:, 1:4]).all(axis=1)
+        if not is_right.all():
+            line = _line(content, int(np.argmin(is_right)))
+            raise TrackingError(f"{path}: the quaternion of line {line} has not length 1, or its place is not finite")
         rises = rows[1:, 0] > rows[:-1, 0]
         if not rises.all():
             line = _line(content, int(np.argmin(rises)) + 1)
@@ -213,21 +212,20 @@ class Trajectory:
         readings["wxyz", "sensor"] = poses_of(rows[:, 1:4], np.roll(units, -1, axis=1))
         readings |= {(order, "world"): _inverse(poses) for (order, _), poses in readings.items()}
         poses = readings[read_as]
+        axes = np.eye(4)
+        axes[:3, :3] = mounting.rotation().T
+        of_vehicle = {key: each @ axes for key, each in readings.items()}
+        usual = of_vehicle[read_as]
         others = [key for key in readings if quaternion in (None, key[0]) and maps_from in (None, key[1])]
-        if np.isfinite(rows).all():
-            axes = np.eye(4)
-            axes[:3, :3] = mounting.rotation().T
-            of_vehicle = {key: each @ axes for key, each in readings.items()}
-            usual = of_vehicle[read_as]
-            others = [key for key in others if _fits_better(of_vehicle[key], usual, rows[:, 0])]
-            if others:
-                likeness = {key: _likeness(of_vehicle[key]) for key in others}
-                best = max(others, key=lambda key: (likeness[key][0], round(sum(likeness[key][1:]), 2)))
-                raise TrackingError(
-                    f"{path}: read as {_reading(*read_as)}, the poses are those of a vehicle whose z axis points "
-                    f"{_directions(usual)}; read as {_reading(*best)}, {_directions(of_vehicle[best])}. Say which is "
-                    "right: quaternion= or --quaternion, xyzw or wxyz; maps_from= or --poses-from, sensor or world"
-                )
+        others = [key for key in others if _fits_better(of_vehicle[key], usual, rows[:, 0])]
+        if others:
+            likeness = {key: _likeness(of_vehicle[key]) for key in others}
+            best = max(others, key=lambda key: (likeness[key][0], round(sum(likeness[key][1:]), 2)))
+            raise TrackingError(
+                f"{path}: read as {_reading(*read_as)}, the poses are those of a vehicle whose z axis points "
+                f"{_directions(usual)}; read as {_reading(*best)}, {_directions(of_vehicle[best])}. Say which is "
+                "right: quaternion= or --quaternion, xyzw or wxyz; maps_from= or --poses-from, sensor or world"
+            )
         speed = _speed(poses, rows[:, 0])
         if FASTEST_MPS < speed < math.inf:
             raise TrackingError(
@@ -394,13 +392,10 @@ def merge(
     ranges_m = min_range_m if isinstance(min_range_m, Sequence) or np.ndim(min_range_m) else [min_range_m] * len(rows)
     ranges_m = OPTIONS.numbers("min_range_m, one for each scan,", ranges_m, len(rows), 0.0)
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
-    begin = 0
-    for k, (scan, given, range_m) in enumerate(zip(rows, poses, ranges_m, strict=True)):
+    parts = np.split(merged, np.cumsum([*map(len, rows)])[:-1])
+    for k, (scan, given, range_m, part) in enumerate(zip(rows, poses, ranges_m, parts, strict=True)):
         pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
-        R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
-        seen = blank_too_near(scan, range_m)
-        fill_moved(seen, R, t, merged[begin : begin + len(scan)])
-        begin += len(scan)
+        fill_moved(blank_too_near(scan, range_m), np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), part)
     return merged
 
 
@@ -454,15 +449,15 @@ def _fits_better(other: Floats, poses: Floats, times_s: Floats) -> bool:
         for one, another, answer in ((other_keeps, keeps, True), (keeps, other_keeps, False)):
             if one > SAME_WAY and 1.0 - another > STRAIGHTER * (1.0 - one) + STRAIGHT:
                 return answer
+    if max(keeps, other_keeps) < SAME_WAY and up < -UPRIGHT:  # to and fro, and on the roof
+        return other_up > UPRIGHT
     if is_other != is_vehicle:
         return is_other and not keeps > SAME_WAY > other_keeps
     return other_keeps > SAME_WAY > keeps and (is_vehicle or up < UPRIGHT)
 
 
 def _likeness(poses: Floats) -> tuple[bool, float, float]:
-    """Whether the poses are those of a vehicle, how well its way keeps its direction in the sensor, 0 to 1, and how
-    upright it is.
-    """
+    """Whether the poses are a vehicle's, how well its way keeps its direction in it, 0 to 1, and how upright it is."""
     up, way = _up_and_way(poses)
     is_vehicle = up > UPRIGHT and (way is None or way[0] > FORWARD)
     return is_vehicle, SAME_WAY if way is None else float(np.linalg.norm(way)), up
