@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import PointsError
 from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
+from ..readers.times import middle_after
 from ..tracking.tracks import Tracks
 from ..types.points import Floats, Floats32, Points
 from ..types.sensor import SensorProfile
@@ -21,14 +22,14 @@ class Straightener:
         self._trajectory = trajectory
         self._begin: Floats | None = None  # pose of the first scan
         self.pose: Floats | None = None  # that of the last scan, seen from the first one; None without a trajectory
+        self._middle_s = -np.inf  # of the times of the last scan
         self._tracked: list[Tracks] = []
 
     def straighten(
         self, stamp_s: float | None, points: Points, times_s: Floats | None, sensor: SensorProfile | None = None
     ) -> Floats32:
         """Points in the sensor's frame at the scan's stamp, or at its last point if the stamp is on another clock; what
-        the sensor drops stays where it is: the own vehicle moves with it. Without poses, the first two scans of a
-        session stay as they are, with a warning.
+        the sensor drops stays where it is: the own vehicle moves with it. Without poses, the first two scans stay.
         """
         if times_s is None:
             raise PointsError(
@@ -41,6 +42,7 @@ class Straightener:
             return points
         first_s, last_s = float(known.min()), float(known.max())
         if self._trajectory is not None:
+            self._middle_s = middle_after(self._middle_s, stamp_s, first_s, last_s)
             motion = self._trajectory.motion(first_s, last_s)
         elif len(self._tracked) == 2:
             before, last = self._tracked

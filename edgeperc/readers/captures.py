@@ -251,10 +251,8 @@ def _known_sensor(path: Path, kind: str, topic: str | None) -> KnownSensor:
         if "spinning" in description:
             return of_spinning(description["spinning"], description["lasers_deg"], description["columns"])
         return of_cloud(description)
-    except SensorError as exc:
-        raise type(exc)(f"{path}: {exc}") from exc
-    except PointsError as exc:
-        raise PointsError(f"{path}: {str(exc).removeprefix(f'{path}: ')}") from exc
+    except (PointsError, SensorError) as exc:
+        raise type(exc)(f"{path}: {str(exc).removeprefix(f'{path}: ')}") from exc
 
 
 def scan_files(folder: Path) -> list[Path]:

@@ -36,7 +36,7 @@ from .ply import parse_ply
 from .raw import column_names, parse_raw
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
 from .text import begins_like_text, parse_text
-from .times import TimedScan, point_times
+from .times import LONGEST_S, TimedScan, point_times
 from .unknown import advice_for, missing
 
 
@@ -143,9 +143,11 @@ def parse_points(content: bytes, name: str) -> Floats32:
 
 
 def read_timed_file(path: Path, options: FileOptions) -> TimedScan:
-    """Read a scan file with the times of its points; errors as `read_points`."""
+    """Read a scan file with the times of its points; on a clock, the last is its stamp. Errors as `read_points`."""
     read = _read(path, options)
-    return TimedScan(None, read.points, point_times(read.fields, read.points, None))
+    times_s = point_times(read.fields, read.points, None)
+    last_s = 0.0 if times_s is None else float(np.nanmax(times_s))
+    return TimedScan(last_s if last_s >= LONGEST_S else None, read.points, times_s)
 
 
 class _Read(NamedTuple):
@@ -161,9 +163,7 @@ class _Read(NamedTuple):
     def missing(self) -> str:
         """What a file that was cut short lacks, or what of a longer one is not read, as a sentence."""
         if self.n_missing < 0:
-            return (
-                f"{-self.n_missing:,} points follow the {len(self.points):,} that the header declares, and are not read"
-            )
+            return f"{-self.n_missing:,} points follow the {len(self.points):,} that the header declares: not read"
         there = f"the first {len(self.points):,} of {len(self.points) + self.n_missing:,} points are there"
         return f"cut short: {there}, so a part of the surroundings is missing"
 
@@ -249,11 +249,7 @@ def _of_named(columns: Columns, options: FileOptions) -> _Read:
 def _check_unused(names: Iterable[str], options: FileOptions) -> None:
     """Say that names of columns are not taken; without the path, so that it is said once for a folder."""
     if options.columns is not None:
-        warnings.warn(
-            f"columns= (--columns) is not used: the file names its values, {', '.join(names)}",
-            UserWarning,
-            stacklevel=2,
-        )
+        warnings.warn(f"columns= (--columns) is not used: the file names its values, {', '.join(names)}", stacklevel=2)
 
 
 def _of_values(columns: Columns, options: FileOptions) -> _Read:

@@ -25,7 +25,7 @@ _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "
 
 # How long a scan takes [s]. The longest is 1,000 times the shortest, as each unit is of the next, so one unit at most
 # gives a duration between them.
-_SHORTEST_S, _LONGEST_S = 2e-3, 2.0
+_SHORTEST_S, LONGEST_S = 2e-3, 2.0
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 
 # How long a LiDAR takes for a turn [s]: 5 to 20 turns a second, with a margin.
@@ -52,7 +52,7 @@ class TimedScan(NamedTuple):
     Attributes
     ----------
     stamp_s : float or None
-        Time of the scan, as `edgeperc.read_scans` yields it [s].
+        Time of the scan, as `edgeperc.read_scans` yields it [s]; of a file, the last of times on a clock.
     points : (n, 4) float32
         As `edgeperc.read_scans` yields them.
     times_s : (n,) float64 or None
@@ -96,9 +96,10 @@ def point_times(fields: Mapping[str, NDArray[Any]], points: Points, stamp_s: flo
     shows &= ~np.isnan(moments)
     first, last = _range(moments[shows])
     for unit in _UNITS_S:
-        if _SHORTEST_S <= (last - first) * unit < _LONGEST_S:
-            counted = max(abs(first), abs(last)) * unit < _LONGEST_S
-            moments[shows & ((moments < first) | (moments > last))] = np.nan
+        if _SHORTEST_S <= (last - first) * unit < LONGEST_S:
+            counted = max(abs(first), abs(last)) * unit < LONGEST_S
+            beside = np.where(shows, 0.0, last - first)  # where nothing returned, drivers write no time: 0
+            moments[(moments < first - beside) | (moments > last + beside)] = np.nan
             shows &= ~np.isnan(moments)
             _check_turn(xyz[shows], (moments[shows] - first) / (last - first), (last - first) * unit, name)
             with np.errstate(over="ignore", invalid="ignore"):
@@ -120,7 +121,7 @@ def _carry_on(moments: Floats, shows: Mask) -> None:
     for unit, period in periods:
         duration = ended + period - began
         is_clock = first >= 0.0 and last <= period and duration < (1.0 - _EMPTY_SHARE) * period
-        if is_clock and _SHORTEST_S <= duration * unit < _LONGEST_S:
+        if is_clock and _SHORTEST_S <= duration * unit < LONGEST_S:
             moments[moments <= ended] += period
             return
     is_one = [np.ptp(moments[side]) == 0.0 and np.count_nonzero(side) > 1 for side in (early, late)]
@@ -156,11 +157,18 @@ def _check_turn(xyz: Points, shares: Floats, duration_s: float, name: str) -> No
         )
 
 
-def of_plausible_duration(scans: Iterable[TimedScan]) -> Iterator[TimedScan]:
-    """The scans of a stream. Raises PointsError if the times of points contradict the stamps of scans.
+def middle_after(before_s: float, stamp_s: float | None, first_s: float, last_s: float) -> float:
+    """The middle of the times of a scan; StampError if it has no stamp, and they begin before that of the last scan."""
+    if stamp_s is None and last_s < LONGEST_S and first_s <= before_s:
+        raise StampError(
+            "the times of the points begin anew with each scan, and its file has no stamp; expected times on one "
+            "clock: record them so, or add the time of each scan; --deskew --track without --poses needs none"
+        )
+    return 0.5 * (first_s + last_s)
 
-    That is where a scan lasts longer than it takes to the next one.
-    """
+
+def of_plausible_duration(scans: Iterable[TimedScan]) -> Iterator[TimedScan]:
+    """The scans of a stream. Raises PointsError where, by its points' times, one lasts longer than to the next."""
     stamp_s: float | None = None
     intervals_s = deque[float](maxlen=_INTERVALS)
     for scan in scans:
@@ -217,8 +225,8 @@ def accumulate(
     PointsError
         A scan is not points, or has not one time for each of them.
     StampError
-        A scan has neither times nor a finite stamp, or no pose of a trajectory is near its times. Or they are
-        beyond 1e12 s, or in a float32 that rounds them by milliseconds.
+        A scan has neither times nor a finite stamp, or no pose of a trajectory is near its times. Or they begin anew
+        with each scan without a stamp, or are beyond 1e12 s, or in a float32 that rounds them by milliseconds.
     OptionError
         ``accumulate_s`` is not 0.01 to 10 s, or ``motion`` is neither.
     """
@@ -238,7 +246,7 @@ def accumulate(
         return TimedScan(stamp_s, points, times_s)
 
     kept = deque[tuple[Points, Floats, float]]()
-    begin_s = end_s = 0.0
+    begin_s, end_s, middle_s = 0.0, 0.0, -np.inf
     last: float | None = None
     is_waiting = False
     for scan in scans:
@@ -256,6 +264,7 @@ def accumulate(
         if np.isnan(times_s).all():
             continue
         first_s, newest_s = float(np.nanmin(times_s)), float(np.nanmax(times_s))
+        middle_s = middle_after(middle_s, stamp_s, first_s, newest_s)
         if not kept or newest_s < end_s:
             kept.clear()
             begin_s, is_waiting = first_s, True

@@ -87,7 +87,7 @@ def test_points_without_return_do_not_hide_the_unit() -> None:
     points[0, :3], points[1, 0] = 0.0, np.nan
     times = np.array([0.0, 7.0, 1.7e9, 1.7e9 + 0.05, 1.7e9 + 0.1, np.nan])
     found = point_times({"timestamp": times}, points, 5.0)
-    np.testing.assert_array_equal(found, times)
+    np.testing.assert_array_equal(found, [np.nan, np.nan, *times[2:]])  # nor do they begin the scan in 1970
 
 
 @pytest.mark.parametrize(
@@ -212,23 +212,28 @@ def table(times: NDArray[Any], points: NDArray[np.float64], name: str, kind: str
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "count"),
-    [("t", "<u4", 1e9), ("time", "<f4", 1.0), ("timestamp", "<f8", 1.0), ("Time", "<f8", 1e3)],
+    ("name", "kind", "count", "end_s"),
+    [
+        ("t", "<u4", 1e9, 0.1),
+        ("time", "<f4", 1.0, 0.1),
+        ("timestamp", "<f8", 1.0, 1700.1),
+        ("Time", "<f8", 1e3, 0.1),
+    ],
 )
 @pytest.mark.parametrize("suffix", ["ascii.pcd", "binary.pcd", "ply", "npy"])
-def test_scan_files(tmp_path: Path, name: str, kind: str, count: float, suffix: str) -> None:
-    points, times = turn(0.1)
+def test_scan_files(tmp_path: Path, name: str, kind: str, count: float, end_s: float, suffix: str) -> None:
+    points, times = turn(end_s)
     rows = table(np.round(times * count, 6), points, name, kind)
     content = {
         "npy": npy(rows), "ply": ply_of(rows), "ascii.pcd": pcd_of(rows, "ascii"), "binary.pcd": pcd_of(rows)
     }  # fmt: skip
     path = save(tmp_path, f"scan.{suffix}", content[suffix])
     (found,) = list(read_timed_scans(path))
-    assert found.stamp_s is None
+    assert found.stamp_s == pytest.approx(end_s if end_s > 2.0 else None)
     np.testing.assert_array_equal(found.points, points.astype(np.float32))
     np.testing.assert_array_equal(edgeperc.read_points(path), found.points)
     np.testing.assert_allclose(found.times_s, times, atol=1e-6)
-    check_straight(found, 0.1, 1e-3)
+    check_straight(found, end_s, 1e-3)
 
 
 def test_files_without_times(tmp_path: Path) -> None:
@@ -351,6 +356,11 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
     write_tum(poses, times + 5.0, [pose_at(t) for t in 0.1 * np.arange(10)])
     with pytest.raises(edgeperc.StampError, match="poses around it"):
         Straightener(Trajectory.from_tum(poses)).straighten(*scan)
+    straightener = Straightener(true_trajectory())
+    for stamp_s in (None, 0.2):  # a file with times from 0 may be on a clock that begins there; two are not
+        straightener.straighten(stamp_s, scan.points, scan.times_s - scan.times_s[0])
+    with pytest.raises(edgeperc.StampError, match="begin anew with each scan"):
+        straightener.straighten(None, scan.points, scan.times_s - scan.times_s[0] + 0.001)
 
 
 @pytest.mark.compiled
@@ -551,6 +561,8 @@ def test_what_cannot_be_gathered() -> None:
     for unit, holds in ((1.7e18, "got times of 1.7e\\+18 s"), (np.float32(1.7e9), "float32 holds to 1.3e\\+02 s")):
         with pytest.raises(StampError, match=f"{holds}.*expected float64"):  # of all scans, none is 0.1 s later
             next(accumulate([TimedScan(None, np.ones((1, 4), np.float32), np.full(1, unit))] * 2, 0.1))
+    with pytest.raises(StampError, match="begin anew with each scan"):
+        list(accumulate([TimedScan(None, np.ones((2, 4), np.float32), np.array([k, 0.1])) for k in (0.0, 0.01)], 0.1))
     with pytest.raises(StampError, match="expected poses around it"):
         next(accumulate([TimedScan(7.0, np.ones((3, 4), np.float32), None)], 0.5, true_trajectory()))
     assert list(accumulate([TimedScan(0.0, np.ones((2, 4), np.float32), np.full(2, np.nan))], 0.5)) == []
