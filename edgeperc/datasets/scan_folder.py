@@ -24,6 +24,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -248,7 +249,8 @@ class ScanFolder:
             There is no such scan, or one of its files cannot be read.
         """
         if name not in self.drives:
-            raise PointsError(f"{self.root} has no labeled scan {name!r}; its names are those of the files in velodyne")
+            some = ", ".join(map(repr, islice(self.drives, 3)))
+            raise PointsError(f"{self.root} has no labeled scan {name!r}; it has {len(self.drives)}: {some}, …")
         if self._tree is not None:
             points, labeled, numbers, polygons = self._tree.read(name)
             checked = None if labeled is None else self._checked(labeled, self.scans[name])
