@@ -41,7 +41,7 @@ class BagSink:
     Raises
     ------
     OptionError
-        The folder exists, or the installed rosbags writes no MCAP.
+        The folder exists, or rosbags cannot write it: MCAP before 0.10, sqlite3 where a path has #, ? or %.
     MissingExtraError
         rosbags is not installed.
     """
@@ -68,6 +68,10 @@ class BagSink:
                     "0.9.23), or choose the storage sqlite3"
                 )
             how["storage_plugin"] = rosbag2.StoragePlugin.MCAP
+        elif {*"#?%"} & {*str(self._folder)}:  # rosbags' sqlite3 takes the path as a URI: it would write elsewhere
+            raise OptionError(
+                f"rosbags writes no sqlite3 at {self._folder}, for '#', '?' or '%' there; choose another place, or MCAP"
+            )
         self._beside = beside(self._folder)
         # A bag's files have the name of its folder.
         self._writer = rosbag2.Writer(self._beside / self._folder.name, **how)

@@ -440,6 +440,9 @@ def test_a_bag_overwrites_nothing(tmp_path: Path) -> None:
         there.mkdir() if there.name == "folder" else there.write_text("")
         with pytest.raises(edgeperc.OptionError, match="exists; a bag does not overwrite"):
             BagSink(there)
+    for name in ("drive #2", "drive?", "50%25"):  # in a URI, the end of a path, or another character
+        with pytest.raises(edgeperc.OptionError, match="rosbags writes no sqlite3 at"):
+            BagSink(tmp_path / name / "bag")
 
 
 def test_without_a_scan_there_is_no_bag(tmp_path: Path) -> None:
