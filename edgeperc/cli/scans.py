@@ -219,18 +219,22 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
 
 
 def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorEstimate | None:
-    """The sensor that the first scans show; None if none that can be read has enough points. Raises SensorError."""
+    """The sensor of the first scans; None without enough points. Raises SensorError; of unreadable captures, their error."""
     from ..preprocess.sensor_estimate import MOST_SCANS, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
-    scans: list[Floats32] = []
+    scans, damage = list["Floats32"](), None
     for path in islice(paths, _LOOKED_AT):
-        with suppress(EdgepercError, OSError):  # reported when the scan's turn comes
+        try:
             how = reading_options(path, arguments) | ({"origin_m": None} if is_capture(path) else {})
             read = islice(read_scans(path, **how), MOST_SCANS)
             scans.extend(points for _, points in read if has_enough_points(points))
+        except (EdgepercError, OSError) as exc:  # of a scan file, reported when its turn comes
+            damage = exc if is_capture(path) else damage
         if len(scans) >= MOST_SCANS:
             break
+    if damage is not None and not scans:
+        raise damage
     return sensor_in(scans[:MOST_SCANS]) if scans else None
 
 
@@ -285,10 +289,10 @@ def scan_sensor(
             files = scan_files(path) if is_folder(path) else beside or [path]
         try:
             found = find_sensor(files, arguments)
-        except SensorError as exc:
-            raise exc if unnamed is None else unnamed from exc
-        if found is None and (unnamed is not None or arguments.sensor == AUTO_SENSOR):
-            raise unnamed or SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
+            if found is None and (unnamed is not None or arguments.sensor == AUTO_SENSOR):
+                raise SensorError("the sensor cannot be told: no scan has enough points; pass --sensor NAME")
+        except (EdgepercError, OSError) as exc:
+            raise exc if unnamed is None else SensorError(f"{unnamed} Nor do the points tell: {exc}") from exc
         if found is None:  # so few points are refused, or warned of, when they are perceived
             return with_mounting(DEFAULT_SENSOR, arguments), "the default: too few points to tell"
         found.tell_doubt(getattr(arguments, "on_mismatch", None), f"{path}: ")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..types.points import Floats32, as_float64, as_points
+from ..types.points import Floats32, MapError, as_float64, as_points
 
 # PointField.datatype, from 1.
 _CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -35,8 +35,10 @@ class PackedField:
     count: int
 
 
-# Of Livox' own messages: the packages that define one, and the fields of a point.
+# Of Livox' own messages: the packages that define one, by encoding, and the fields of a point.
 _LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+_LIVOX_CDR = tuple((f"{package}/msg/CustomMsg", "cdr") for package in _LIVOX_PACKAGES)
+_LIVOX_ROS1 = tuple((f"{package}/CustomMsg", "ros1") for package in _LIVOX_PACKAGES)
 _LIVOX_FIELDS = (
     PackedField("offset_time", 0, 6, 1),
     *(PackedField(name, 4 * k, 7, 1) for k, name in enumerate("xyz", start=1)),
@@ -209,14 +211,8 @@ CLOUD_READERS: MappingProxyType[tuple[str, str], Callable[[memoryview], Cloud]] 
         ("sensor_msgs/msg/PointCloud2", "cdr"): lambda content: _ros_cloud(cdr_reader(content)),
         ("sensor_msgs/PointCloud2", "ros1"): lambda content: _ros_cloud(ros1_reader(content)),
         ("foxglove.PointCloud", "protobuf"): _foxglove_cloud,
-        **{
-            (f"{package}/msg/CustomMsg", "cdr"): lambda content: _livox_cloud(cdr_reader(content))
-            for package in _LIVOX_PACKAGES
-        },
-        **{
-            (f"{package}/CustomMsg", "ros1"): lambda content: _livox_cloud(ros1_reader(content))
-            for package in _LIVOX_PACKAGES
-        },
+        **dict.fromkeys(_LIVOX_CDR, lambda content: _livox_cloud(cdr_reader(content))),
+        **dict.fromkeys(_LIVOX_ROS1, lambda content: _livox_cloud(ros1_reader(content))),
     }
 )
 """What reads a point cloud of a type in an encoding."""
@@ -245,7 +241,13 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> Floats3
     cloud = cloud_table(message)
     if remission_field is None and is_ouster_cloud(cloud.dtype.names or ()):
         remission_field = "reflectivity"
-    return as_points(cloud, remission_field=remission_field)
+    try:
+        return as_points(cloud, remission_field=remission_field)
+    except MapError as exc:
+        raise PointsError(
+            f"the clouds have coordinates of a map (frame {message.header.frame_id!r}), which float32 would round; "
+            "take those of the sensor, before they are moved, or save each as a .npy, for origin_m= or --origin X Y Z"
+        ) from exc
 
 
 def cloud_table(message: Any) -> NDArray[Any]:
@@ -295,14 +297,13 @@ def is_ouster_cloud(names: Sequence[str]) -> bool:
 def _ring_elevations(message: Any) -> list[float | None]:
     """Median elevation of each ring or, without rings, of each row of an organized cloud [deg]."""
     cloud = cloud_table(message)
-    names = cloud.dtype.names or ()
-    if "ring" in names:
+    if "ring" in (cloud.dtype.names or ()):
         ring = as_float64(cloud["ring"].ravel())
     elif 1 < len(cloud) <= _MOST_RINGS:
         ring = np.repeat(np.arange(len(cloud), dtype=np.float64), cloud.shape[1])
     else:
         return []
-    points = as_float64(as_points(cloud))
+    points = as_float64(cloud_points(message))
     across = np.hypot(points[:, 0], points[:, 1])
     with np.errstate(invalid="ignore"):
         far = np.isfinite(points).all(axis=1) & (across > _ELEVATION_FROM_M)

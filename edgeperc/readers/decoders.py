@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
-from ..types.points import MapError, is_remission_name, table_columns
+from ..types.points import is_remission_name, table_columns
 from .alternation import told_apart
 from .bags import open_bag
 from .clouds import CLOUD_READERS, Cloud, cloud_points, cloud_table, describe_cloud
@@ -351,14 +351,7 @@ def _bag_scans(job: _Job, times: bool) -> Iterator[TimedScan]:
                 turns = turns if isinstance(turns, LidarMessages) else LidarMessages(job.path)
                 yield from turns.add(message, stamp_s)
                 continue
-            try:
-                points = cloud_points(message, remission_field=job.remission_field)
-            except MapError as exc:
-                raise PointsError(
-                    f"the clouds have coordinates of a map (frame {message.header.frame_id!r}), which float32 would "
-                    "round; record those of the sensor, before they are moved, or save each as a .npy, and pass its "
-                    "place there: origin_m= or --origin X Y Z"
-                ) from exc
+            points = cloud_points(message, remission_field=job.remission_field)
             times_s = point_times(table_columns(cloud_table(message)), points, stamp_s) if times else None
             yield TimedScan(stamp_s, points, times_s)
     except PointsError:  # the end of the file, which is damaged

@@ -17,8 +17,6 @@ from .tables import MAX_BYTES
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
-
-
 ALIVE_EVERY = 64  # records
 Message = tuple[int, int, memoryview]  # number of the channel, time of recording [ns], bytes
 

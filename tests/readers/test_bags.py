@@ -21,6 +21,7 @@ from test_apart import chunked_mcap
 from test_captures import BAGS, LIDAR, OTHER, POINTS, error_of, write_bag1, write_bag2, write_mcap
 
 import edgeperc
+from cli_helpers import Shell
 from edgeperc.errors import MissingExtraError, PointsError
 from edgeperc.readers.bags import bag_files
 from edgeperc.readers.captures import read_scans
@@ -303,13 +304,25 @@ def test_frames_of_one_topic_are_several_sensors(tmp_path: Path, frames: Sequenc
     assert f"no topic of type sensor_msgs/PointCloud2 '{OTHER}'" in error_of(folder, topic=f"{OTHER}@front")
 
 
+@pytest.mark.parametrize("case", [("xyz", 0, "enough points"), ("xyz", 5000, "be told from"), ("ab", 9, "z among a")])
+def test_of_a_bag_that_names_no_sensor_it_is_said_what_is_wrong_with_its_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell, case: tuple[str, int, str]
+) -> None:
+    monkeypatch.setattr("test_captures.LAYOUT", [(axis, "f4") for axis in (*case[0], "intensity")])
+    monkeypatch.setattr("test_captures.POINTS", np.random.default_rng(0).uniform(-20, 20, (case[1], 4)).astype("f4"))
+    assert case[2] in shell.err("info", write_bag2(tmp_path / "bag"), code=1)
+
+
 @pytest.mark.parametrize("name", [*BAGS])
 @pytest.mark.parametrize("place", [(512345.25, 5412345.5, 113.0, 0.0), (4.1e6, 6e5, 4.8e6, 0.0), (0.0, -3e5, 0.0, 0.0)])
 def test_clouds_with_coordinates_of_a_map_are_not_sent_to_an_option_that_refuses_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, place: Sequence[float]
 ) -> None:
-    monkeypatch.setattr("test_captures.LAYOUT", [(axis, "f8") for axis in ("x", "y", "z", "intensity")])
+    monkeypatch.setattr("test_captures.LAYOUT", [(axis, "f8") for axis in ("x", "y", "z", "ring")])
     monkeypatch.setattr("test_captures.POINTS", POINTS.astype("f8") + np.array(place) + 0.123)
-    error = error_of(BAGS[name](tmp_path / name))
-    assert "the clouds have coordinates of a map (frame 'lidar')" in error
-    assert "record those of the sensor, before they are moved, or save each as a .npy" in error
+    bag = BAGS[name](tmp_path / name)
+    with pytest.raises(PointsError) as of_rings:
+        edgeperc.sensor_of(bag)
+    for error in (error_of(bag), str(of_rings.value)):
+        assert "the clouds have coordinates of a map (frame 'lidar')" in error
+        assert "take those of the sensor, before they are moved, or save each as a .npy" in error
