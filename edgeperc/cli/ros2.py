@@ -127,13 +127,13 @@ def ros2_command(arguments: argparse.Namespace) -> int:
     graph = _open_graph(arguments)
     try:
         _take_parameters(graph, arguments)
-        perceiver = None if arguments.sensor is None else _perceiver(arguments, arguments.sensor)
+        made = [] if arguments.sensor is None else [_perceiver(arguments, arguments.sensor)]
 
         def perceiver_for(cloud: Mapping[str, Any]) -> Perceiver:
             from ..readers.identify import of_cloud
 
-            if perceiver is not None:
-                return perceiver
+            if arguments.sensor is not None:  # anew after a cleanup, which forgets
+                return made.pop() if made else _perceiver(arguments, arguments.sensor)
             try:
                 known = of_cloud(cloud)
             except SensorError as unnamed:

@@ -131,7 +131,7 @@ class PerceptionNode:
         self._points: Floats32 | None = None
         self._n_earlier = 0  # of these points: those of clouds before the newest
         self._gather_s: float | None = None  # time over which scans are gathered; None: not known yet, 0: not at all
-        self._recent: deque[bytes] = deque(maxlen=_MOST_GATHERED)
+        self._recent: deque[tuple[int, bytes]] = deque(maxlen=_MOST_GATHERED)  # when they came [ns]
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
         self._pose: Floats | None = None  # of the last cloud in the frame of the odometry
@@ -223,7 +223,7 @@ class PerceptionNode:
     def _receive(self, data: bytes) -> None:
         if self._state == "active":
             if self._gather_s != 0.0:
-                self._recent.append(data)
+                self._recent.append((time.time_ns(), data))
             self._waiting.put(data)
 
     @property
@@ -333,11 +333,11 @@ class PerceptionNode:
 
     def _earlier(self, newest: bytes, stamp_ns: int, gather_s: float) -> Iterator[Floats32]:
         """Points of the clouds that came in the time before the newest, dropped ones, too: `edgeperc.accumulate`."""
-        for data in takewhile(lambda each: each is not newest, tuple(self._recent)):
+        for came_ns, data in takewhile(lambda each: each[1] is not newest, tuple(self._recent)):
             try:
                 cloud = self._messages.decode(data, messages.CLOUD)
                 stamp = cloud.header.stamp
-                is_recent = 0 < stamp_ns - (stamp.sec * 10**9 + stamp.nanosec) < gather_s * 1e9
+                is_recent = 0 < stamp_ns - (stamp.sec * 10**9 + stamp.nanosec or came_ns) < gather_s * 1e9
                 if is_recent and cloud.header.frame_id == self._cloud_frame:
                     yield cloud_points(cloud)
             except PointsError:  # which is told of a cloud that is the newest

@@ -509,7 +509,7 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, made: list[Any]) -> None
 def test_clouds_that_do_not_name_their_sensor_show_it(
     bus: Bus, made: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in ([], ["--mount-height", "1.7"]):
+    for words in ([], ["--mount-height", "1.7"], ["--sensor", "vlp-32c"]):
         assert main(["ros2", *words, "--rclpy"]) == 2
     cloud = {"topic": "/points", "frame": "lidar", "fields": ["x", "y", "z", "intensity"], "elevations_deg": []}
     perceive = made[0][0](cloud)
@@ -518,6 +518,7 @@ def test_clouds_that_do_not_name_their_sensor_show_it(
     assert perceive.sensor.name == "vlp-32c"
     with pytest.raises(SensorError, match="do not name their sensor"):  # the mounting is a part of the profile
         made[1][0](cloud)
+    assert made[2][0](cloud) is not made[2][0](cloud)  # the second time after a cleanup, which forgets
 
 
 def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:

@@ -287,14 +287,17 @@ def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
     assert [found[0].id for found in (tracked, twice)] == ["1", ""]
 
 
-def test_clouds_of_a_sensor_that_does_not_spin_are_gathered() -> None:
+@pytest.mark.parametrize(
+    ("gather_s", "stamps", "n"),
+    [(0.2, [10, 11, 12, 5], [3, 6, 6, 3]), (10.0, [0, 0, 0], [3, 6, 9])],  # 0: the time is that of this computer
+)
+def test_clouds_of_a_sensor_that_does_not_spin_are_gathered(gather_s: float, stamps: list[int], n: list[int]) -> None:
     """As those of a file are: alone, each has a part of the points that its profile says."""
     perceive = Perceive()
-    perceive.sensor = get_sensor("mid-360").accumulated(0.2)
-    clouds = [cloud(POINTS + k, 10**8 * stamp) for k, stamp in enumerate((10, 11, 12, 5))]
-    graph, outcomes = answered(clouds, perceive)
-    assert [scan.perception.n_points for scan in outcomes] == [3, 6, 6, 3]
-    np.testing.assert_array_equal(outcomes[2].points, np.concatenate([POINTS + 1, POINTS + 2]))
+    perceive.sensor = get_sensor("mid-360").accumulated(gather_s)
+    graph, outcomes = answered([cloud(POINTS + k, 10**8 * stamp) for k, stamp in enumerate(stamps)], perceive)
+    assert [scan.perception.n_points for scan in outcomes] == n
+    np.testing.assert_array_equal(outcomes[2].points[-6:], np.concatenate([POINTS + 1, POINTS + 2]))
     parts = [MESSAGES.decode(data, CLOUD) for data in graph.published["/edgeperc/ground_points"]]
     assert all(part.width <= len(POINTS) for part in parts)
 
