@@ -219,7 +219,7 @@ def stated_sensor(arguments: argparse.Namespace) -> str:
 
 
 def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorEstimate | None:
-    """The sensor of the first scans; None without enough points. Raises SensorError; of unreadable captures, their error."""
+    """The sensor of the first scans; None without enough points. Raises SensorError, and the error of a capture."""
     from ..preprocess.sensor_estimate import MOST_SCANS, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
