@@ -5,6 +5,7 @@ import functools
 import io
 import itertools
 import json
+import math
 import re
 import sys
 import threading
@@ -28,7 +29,7 @@ from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 from edgeperc.view import canvas, draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
-from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED, PANEL
+from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, INK, MISSED, PANEL
 from edgeperc.view.content import ground_plane, paint_points, paint_vehicles
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -674,3 +675,23 @@ def test_tracks_lie_on_the_scan(
     assert not road[:100].all()
     with pytest.raises(TrackingError, match="one for each"):
         draw_tracks(tracks, under=[flat])
+
+
+@pytest.mark.parametrize("mounting", [MODEL_MOUNTING, Mounting(2.1, 180.0, 3.0, -90.0)])
+def test_an_arrow_ends_where_its_track_will_be(mounting: Mounting) -> None:
+    image = pytest.importorskip("PIL.Image")
+    tracker, frame, pose = Tracker(), ModelFrame(mounting), np.eye(4)
+    pose[:3, :3] = frame.R
+    turns = [0.05 * k for k in range(20)]  # a circle with a radius of 16 m, at 8 m/s
+    cars = [replace(CAR, center=(20.0 + 16.0 * math.sin(a), -16.0 * math.cos(a), -0.9), yaw=a) for a in turns]
+    tracks = [tracker.update(frame.boxes_back([car]), 0.1 * k, pose) for k, car in enumerate(cars)]
+    with image.open(io.BytesIO(draw_tracks(tracks, mountings=[mounting] * 20))) as animation:
+        animation.seek(19)
+        picture = np.asarray(animation.convert("RGB")).astype(np.int16)
+    (track,) = tracks[-1]
+    (now, ahead) = frame.move_boxes([track.box, track.predicted(0.95)])
+    straight = np.add(now.center, [7.6 * math.cos(now.yaw), 7.6 * math.sin(now.yaw), 0.0])
+    assert math.dist(ahead.center, straight) > 1.5
+    for (x, y, _), is_there in ((ahead.center, True), (straight, False)):
+        row, column = round(44 + 10 * (28 - y)), round(10 * (x + 22))
+        assert near(picture[row - 2 : row + 3, column - 2 : column + 3], INK).any() == is_there
