@@ -304,9 +304,12 @@ class _Training:
                 f"runs before), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got {len(own)}, "
                 f"{n_simulated}, fold {fold}. Give the same ones, or an empty folder"
             )
-        for name, digest in json.loads(kept.get("made_of", "{}")).items():  # earlier versions did not write it
+        made_of = ({} if kept["before"] else {"--start-from": ""}) | json.loads(kept.get("made_of", "{}"))
+        for name, digest in made_of.items():  # earlier versions did not write it
             if self.made_of.get(name, digest) != digest:
-                raise ValueError(f"{self.checkpoint} is of a run with another {name}; give the same or an empty folder")
+                other = f"{'another' if digest else 'no'} {name}"
+                raise ValueError(f"{self.checkpoint} is of a run with {other}; give the same or an empty folder")
+        self.made_of = made_of | self.made_of
 
 
 def _digest_of_file(path: Path | None) -> str:
