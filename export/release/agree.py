@@ -200,8 +200,9 @@ def _measure(
         )
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]
-    ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
-    return Measured(labels, mean(ious), ap[0] if ap else None, by)
+    aps = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
+    known = [ap for ap in aps if ap is not None]
+    return Measured(labels, mean(ious), mean(known) if known else None, by)
 
 
 def _measure_objects(

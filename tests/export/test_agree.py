@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import shutil
 from dataclasses import replace
@@ -41,8 +42,7 @@ def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap:
     assert record["loss"] == pytest.approx(loss)
     assert (record["label_agreement"], record["n_scans"]) == (0.75, 1)
     assert (record["mean_iou"], record["fp32_mean_iou"], record["ap"], record["fp32_ap"]) == (mean_iou, 0.8, ap, 0.6)
-    (line,) = summary({"int8": record})
-    assert line.startswith("int8: labels agree on 75.000%")
+    assert summary({"int8": record})[0].startswith("int8: labels agree on 75.000%")
 
 
 def test_what_is_not_measured_has_no_figure() -> None:
@@ -59,8 +59,7 @@ def test_files_must_be_of_one_network_and_one_in_fp32(tmp_path: Path) -> None:
     for models in (["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]):
         with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
             agree(models, kitti=None)
-    path = tmp_path / "pointseg.onnx"
-    shutil.copy(model_path("pointseg"), path)
+    path = Path(shutil.copy(model_path("pointseg"), tmp_path))
     with pytest.raises(PointsError, match="name a KITTI object set"):
         agree([path], kitti=None)
     (tmp_path / "training/label_2").mkdir(parents=True)
@@ -111,5 +110,11 @@ def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Pa
     assert own["command"] == "edgeperc-export agree pointseg --labeled OWN --split test"
     assert own["n_scans"] == 2
     assert own["label_agreement"] > 0.99
+    rows = itertools.cycle([{"ap": None}, {"ap": 0.6}])  # of a set without vehicles, and of another one
+    with pytest.MonkeyPatch.context() as patch:
+        found = {"points": {"all": {"car": {"iou": 0.5}}}}
+        patch.setattr(module, "figures", lambda *_: {**found, "boxes": {"oriented": {"all": {"vehicle": next(rows)}}}})
+        both = {"kitti": kitti_root, "labeled": [ScanFolder(kitti_root / "training", layout)]}
+        assert agree(paths, **both, split="test", n_scans=1)["int8"]["ap"] == 0.6
     for variant, path in zip(resolve("pointseg"), paths, strict=True):
         assert onnx.load(path).graph == onnx.load(variant.path).graph
