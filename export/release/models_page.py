@@ -14,7 +14,8 @@ from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
 from edgeperc.types.choices import SPARSE_MODELS as SPARSE
-from edgeperc.types.views import CameraGeometry, ObjectGeometry, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.detector import PillarGeometry
+from edgeperc.types.views import CameraGeometry, ObjectGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, MAX_LOSS, OPEN, Variant, digest, resolve
 
 from ..recipe import Recipe
@@ -24,11 +25,34 @@ NO_AGREEMENT = "--no-agreement"
 TASKS = {
     "camera": "a class for every pixel of an image",
     "objects": "boxes all around, of places where an object may be",
+    "pillars": "boxes of a detector on pillars",
     "range_image": "a class for every point",
     "top_view": "drivable area and vehicles ahead",
 }
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
+WRITTEN = "Written by `edgeperc-export models FOLDER` from the cards in the files; `edgeperc info FILE` prints one."
+SHIPPED = (
+    "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again. A name stands for one "
+    "network and its variants. `Perceiver()` and `edgeperc run PATH` take "
+    f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant. "
+    + " ".join(f"For sparse sensors, `{sparse}` takes the place of `{name}`." for name, sparse in SPARSE.items())
+)
+PERCENT = (
+    "All figures are percentages. In brackets: 95 % bootstrap intervals over drives (over scenes for simulation), if "
+    "two or more have the class. Do not average tables of real and simulated scans."
+)
+FIGURES = (
+    f"Figures of scans are on the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained or "
+    f"chosen, and on simulated scans. {PERCENT} The figures are of each network alone, before the agreement of points, "
+    "boxes and cells. Simulated scans are of the streets at the time of the model's export. AP of boxes below still "
+    "counts true boxes as missed whose center lies where nothing is labeled: 1 of 57 on the test drives."
+)
+RESEARCH = (
+    "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They are in the "
+    "repository and the source distribution, not in the wheel; use one by its path, `--model "
+    "models/research/NAME.onnx`."
+)
 
 
 def sums_of(folder: Path) -> str:
@@ -43,43 +67,15 @@ def models_page(folder: Path) -> str:
         sorted((variant for path in sorted(of.glob("*.onnx")) for variant in resolve(path)), key=str)
         for of in (folder, folder / "research")
     )
-    lines = [
-        "# Models",
-        "",
-        *_prose(
-            "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints a "
-            "card; `edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again."
-        ),
-        "",
-        *_shipped(shipped),
-        *_precisions(shipped),
-        *_open(shipped),
-        *_validation(folder / "validation.json"),
-        "",
-        "## Figures of the shipped models",
-        "",
-        *_prose(
-            f"Figures of scans are on the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained "
-            "or chosen, and on simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals "
-            "over drives (over scenes for simulation), if two or more have the class. Do not average tables of real "
-            "and simulated scans. The figures are of each network alone, before the agreement of points, boxes and "
-            "cells. Simulated scans are of the streets at the time of the model's export. AP of boxes below still "
-            "counts true boxes as missed whose center lies where nothing is labeled: 1 of 57 on the test drives."
-        ),
-    ]
+    is_own = not {*DEFAULT} <= {variant.name for variant in shipped}
+    lines = ["# Models", "", *_prose(WRITTEN), *([] if is_own else ["", *_prose(SHIPPED)])]
+    lines += [*_table(shipped), *_precisions(shipped), *_open(shipped)]
+    lines += [*_validation(folder / "validation.json"), "", f"## Figures of the {'' if is_own else 'shipped '}models"]
+    lines += ["", *_prose(PERCENT if is_own else FIGURES)]
     for variant in shipped:
         fp32 = variant.precision == "fp32"
         lines += ["", *_model(variant), *_figures_of(variant.card, tuple(BANDS) if fp32 else ALL_RANGES)]
-    lines += [
-        "",
-        "## Research models",
-        "",
-        *_prose(
-            "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They "
-            "are in the repository and the source distribution, not in the wheel; use one by its path, `--model "
-            "models/research/NAME.onnx`."
-        ),
-    ]
+    lines += ["", "## Research models", "", *_prose(RESEARCH)] * bool(research)
     for variant in research:
         lines += ["", *_model(variant), *_figures_of(variant.card, ALL_RANGES)]
     lines += _folds(_read(folder / "folds.json"))
@@ -99,12 +95,7 @@ def _size(variant: Variant) -> str:
     return f"{variant.path.stat().st_size / 1e6:.1f} MB"
 
 
-def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
-    yield from _prose(
-        "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
-        f"{', '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant. "
-        + " ".join(f"For sparse sensors, `{sparse}` takes the place of `{name}`." for name, sparse in SPARSE.items())
-    )
+def _table(variants: Sequence[Variant]) -> Iterable[str]:
     yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):
         own = [variant for variant in variants if variant.name == name]
@@ -116,7 +107,7 @@ def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
 
 def _view(card: ModelCard) -> str:
     view = card.view
-    if isinstance(view, TopViewGeometry):
+    if isinstance(view, TopViewGeometry | PillarGeometry):
         (near, far), (right, left) = view.x_range_m, view.y_range_m
         ranges = f"x {near:g} to {far:g} m, y {right:g} to {left:g} m"
         return f"{view.height} x {view.width} cells of {view.cell_m:g} m, {ranges}"
@@ -124,13 +115,15 @@ def _view(card: ModelCard) -> str:
         return f"{view.height} x {view.width} pixels, images are {view.fit}ed to it"
     if isinstance(view, ObjectGeometry):
         return f"{view.n_points} points within {view.margin_m:g} m of each candidate"
-    assert isinstance(view, RangeImageGeometry)  # no detector on pillars is shipped
-    return (
-        f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
-    )
+    azimuths = f"azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
+    return f"{view.height} x {view.width} pixels, {azimuths}"
 
 
 def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
+    every = [(variant, *of) for variant in variants for of in variant.card.precisions.items()]
+    reduced = [each for each in every if each[1] != "fp32"]
+    if not reduced:
+        return
     yield from ("", "## Precision", "")
     yield from _prose(
         "Agreement of each precision with fp32, after post-processing, on labeled real scans or images. "
@@ -141,20 +134,18 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
         "`perception.providers` shows what ran."
     )
     yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])
-    for variant in variants:
-        for precision, record in variant.card.precisions.items():
-            if precision != "fp32":
-                yield _row(
-                    *(f"{variant.name} {precision}", f"{100 * record['label_agreement']:.2f}"),
-                    *(_share(record[key], 2) for key in ("mean_iou", "fp32_mean_iou", "ap", "fp32_ap")),
-                    *(f"{record['loss']:.2f}", record["n_scans"], record["by"]),
-                )
-    commands = sorted({record["command"] for v in variants for record in v.card.precisions.values()})
+    for variant, precision, record in reduced:
+        yield _row(
+            *(f"{variant.name} {precision}", f"{100 * record['label_agreement']:.2f}"),
+            *(_share(record[key], 2) for key in ("mean_iou", "fp32_mean_iou", "ap", "fp32_ap")),
+            *(f"{record['loss']:.2f}", record["n_scans"], record["by"]),
+        )
+    commands = ", ".join(f"`{command}`" for command in sorted({record["command"] for *_, record in reduced}))
+    roads = " Scans of SemanticKITTI are of a test drive; they serve here only to compare precisions of one network."
     yield ""
     yield from _prose(
         "Mean IoU is of points without background, of vehicles and road, or of the eleven classes of images. Made by "
-        f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they serve "
-        "here only to compare precisions of one network."
+        f"{commands}.{roads * ('SEMANTICKITTI' in commands)}"
     )
 
 
@@ -238,8 +229,8 @@ def _recipe(recipe: Mapping[str, Any]) -> str:
 
 
 def _alone(command: str) -> str:
-    """The command for a network alone; earlier exports were evaluated before there was an agreement."""
-    return command if NO_AGREEMENT in command else f"{command} {NO_AGREEMENT}"
+    """The command for a network alone; earlier exports, without one's own --json, were made before the agreement."""
+    return command if NO_AGREEMENT in command or " --json" in command else f"{command} {NO_AGREEMENT}"
 
 
 def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
@@ -252,6 +243,8 @@ def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
         if source in card.metrics:
             of = card.metrics[source]
             yield from _figures(of, f"{of['n_frames']} {title} scans", bands if source != "simulated" else ALL_RANGES)
+    for name, of in card.metrics.get("folders", {}).items():
+        yield from _figures(of, f"{of['n_frames']} scans of {name}", bands)
 
 
 def _image_figures(figures: Mapping[str, Any]) -> Iterable[str]:
