@@ -239,13 +239,13 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     if card.box_classes:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
     rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]
-    rows += _accuracy_rows(card.metrics)
-    reduced = {
-        name: figures for variant in variants for name, figures in variant.card.precisions.items() if name != "fp32"
-    }
-    for precision, agreement in reduced.items():
+    try:
+        rows += _accuracy_rows(card.metrics)
+    except (AttributeError, KeyError, TypeError, ValueError):  # a card may hold any JSON
+        rows.append(("figures", "not as edgeperc eval --json writes them; --json prints them"))
+    for precision, agreement in (item for variant in variants for item in variant.card.precisions.items()):
         loss, same = agreement.get("loss"), agreement.get("label_agreement")
-        if isinstance(same, float):
+        if precision != "fp32" and isinstance(same, float):
             lost = f", {loss:.2g} points lost" if isinstance(loss, float) else ""
             rows.append((precision, f"{100.0 * same:.2f} % of the labels as in fp32{lost}"))
     return rows
@@ -254,8 +254,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The main figures on each evaluated kind of scans: split, scans and drives, and of each class the objects."""
     rows, split = [], metrics.get("split")
-    for block, data in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
-        figures = metrics.get(block, {})
+    blocks = {"KITTI": "real", "SemanticKITTI": "semantickitti", "simulation": "simulated"}
+    own = {data: metrics.get(block, {}) for data, block in blocks.items()}
+    for data, figures in (*own.items(), *metrics.get("folders", {}).items()):
         points = figures.get("points", {}).get("all", {})
         parts = [_figure("IoU", name, row, "iou", "n_objects") for name, row in points.items() if row.get("n_objects")]
         boxes = figures.get("boxes", {}).get("oriented", {}).get("all", {})
@@ -271,8 +272,8 @@ def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
             parts += [_figure("bird's eye AP at 0.5", name, row, "ap", "n_truth")] if row.get("n_truth") else []
         if parts:
             n, n_drives = figures.get("n_frames", "?"), figures.get("n_drives")
-            of_drives = "" if block == "simulated" or not n_drives else f" of {many(n_drives, 'drive')}"
-            of_drives += f", {split} split" if split and block != "simulated" else ""
+            of_drives = f" of {many(n_drives, 'drive')}" if n_drives and data != "simulation" else ""
+            of_drives += f", {split} split" if split and data != "simulation" else ""
             rows.append((f"on {data}", f"{n} scans{of_drives}, %: {', '.join(parts)}"))
     images = metrics.get("images", {})
     if images.get("all", {}).get("mean_iou") is not None:

@@ -93,11 +93,15 @@ def test_info_of_a_shipped_model_fits_a_screen(name: str, shell: Shell) -> None:
 
 def test_info_folds_what_is_long(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
+    card = replace(card, metrics={"folders": {"mine": POINTSEG.metrics["real"]}})
     monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
     lines = shell.out("info", "pointseg").splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 100
     assert sum(line.endswith(" ...") for line in lines) == 3  # classes are in two rows
+    assert "on mine   21 scans of 3 drives, %: IoU car 65.1 (n=3)" in lines
+    card = replace(card, metrics={"real": 3})  # a stranger's card
+    assert "not as edgeperc eval --json writes them" in shell.out("info", "pointseg")
 
 
 @pytest.mark.usefixtures("fake_models")
