@@ -46,7 +46,7 @@ from ..system.machine import (
 from ..system.printable import printable
 from ..types.card import ModelCard
 from ..types.detector import PillarGeometry
-from ..types.onnx_file import check_graph, read_model
+from ..types.onnx_file import TRUST, check_graph, read_model
 from ..types.points import Floats32
 from ..types.views import CameraGeometry, ObjectGeometry
 from ..zoo import Variant, choose, digest, resolve
@@ -202,8 +202,7 @@ class Session:
         if not folds and short not in ("cpu", "cuda"):
             raise ProviderError(
                 f"{self.path}: it computes sizes from constants alone, which provider {short!r} would do while it "
-                "opens the file, where nothing can stop it; choose provider 'cpu', or pass trusted=True, or --trusted, "
-                "if you know where it comes from"
+                f"opens the file, where nothing can stop it; choose provider 'cpu', or {TRUST}"
             )
         self.sha256 = hashlib.sha256(blob).hexdigest()
         cores = usable_cores()
@@ -565,7 +564,7 @@ def terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
             raise
         raise InferenceError(
             f"{exc} (the first runs of a file that is not trusted may take {after_s:g} s); try again on an idle "
-            "computer, or pass trusted=True, or --trusted, if you know where it comes from"
+            f"computer, or {TRUST}"
         ) from exc
     finally:
         timer.cancel()

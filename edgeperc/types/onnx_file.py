@@ -21,6 +21,7 @@ MAX_ENTRY_BYTES = 16 * 10**6
 MAX_TOP_FIELDS = 10_000  # of the file itself, which has about twenty; a file of empty fields would take minutes to read
 MAX_FIELDS = 1_000_000  # of a whole file; the shipped ones have a few thousand at most
 MAX_DEPTH = 32  # messages within messages; a graph without subgraphs needs 5
+TRUST = "pass trusted=True, or --trusted to edgeperc run, if you know where it comes from"
 MAX_NODES = 20_000
 MAX_WEIGHT_BYTES = 10**9
 MAX_FOLDED = 2**28  # values that onnxruntime computes from constants while it opens a file
@@ -256,9 +257,7 @@ class _GraphCheck:
 
     def _refuse_unless_trusted(self, what: str) -> None:
         if not self._trusted:
-            raise ModelFileError(
-                f"{self._path} {what}; pass trusted=True, or --trusted, if you know where it comes from"
-            )
+            raise ModelFileError(f"{self._path} {what}; {TRUST}")
 
     def _graph(self, start: int, end: int, depth: int) -> None:
         self._initializers(start, end, depth)

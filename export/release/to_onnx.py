@@ -190,9 +190,9 @@ def halve(graph: onnx.GraphProto) -> None:
     graph.node.extend([*casts, *kept])
 
 
-def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
+def write_card(model: onnx.ModelProto, card: ModelCard, path: Path, *, trusted: bool = False) -> None:
     """Write a graph, of any network whose view and outputs a card knows, with its card in place of one in it, and read
-    it back through onnxruntime. Raises CardError, CardMismatchError, ModelFileError, ParityError.
+    it back by a `Session`. Raises CardError, CardMismatchError, ModelFileError, ParityError.
     """
     kept = [p for p in model.metadata_props if p.key != CARD_KEY]
     del model.metadata_props[:]
@@ -202,7 +202,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()
         try:
-            session = Session(Path(file.name), "cpu")
+            session = Session(Path(file.name), "cpu", trusted=trusted)
         except EdgepercError as exc:
             raise type(exc)(str(exc).replace(file.name, str(path))) from exc
         if session.card.to_json() != card.to_json():

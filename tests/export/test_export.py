@@ -19,6 +19,7 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+import pillar_networks as pillars
 import tiny_model
 from database_helpers import simulated_kitti
 from filelock import FileLock
@@ -31,7 +32,7 @@ from cli_helpers import Shell
 from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import fold_of
-from edgeperc.errors import CardMismatchError, ModelError
+from edgeperc.errors import CardMismatchError, ModelError, ModelFileError
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.ground.planes import find_ground
 from edgeperc.inference.projection import make_projector, project
@@ -292,6 +293,7 @@ def test_another_recipe_and_other_data_do_not_resume(tmp_path: Path, simulated: 
     with FileLock(tmp_path / "own/.lock"):
         refused("another training runs in")
     refused("of another recipe: steps 1, now 2; give the same options", recipe=replace(recipe, steps=2))
+    refused("of a run with no --start-from; give the same or an empty", start_from=first)
     fewer = tmp_path / "fewer"
     fewer.mkdir()
     shutil.copy(sorted(simulated.glob("*.npz"))[0], fewer)
@@ -1026,26 +1028,18 @@ def _renamed(model: onnx.ModelProto) -> None:
     model.graph.output[0].name = model.graph.node[-1].output[0] = "scores"
 
 
-def _of_a_plugin(model: onnx.ModelProto) -> None:
-    model.graph.node[0].op_type = "PPScatterPlugin"
-
-
-def _of_two_scans(model: onnx.ModelProto) -> None:
-    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 2
-
-
 def _not_finite(model: onnx.ModelProto) -> None:
     weights = next(each for each in model.graph.initializer if len(each.dims) == 4)
-    values = onnx.numpy_helper.to_array(weights).copy()
-    values[0] = np.nan
-    weights.CopyFrom(onnx.numpy_helper.from_array(values, weights.name))
+    weights.CopyFrom(onnx.numpy_helper.from_array(np.full(weights.dims, np.nan, np.float32), weights.name))
 
 
 FOREIGN = {
     "the graph gives values of 'probabilities' that are not finite": _not_finite,
     r"card names outputs \['probabilities'\], the graph has \['scores'\]": _renamed,
-    "cannot open the graph: .*PPScatterPlugin": _of_a_plugin,
-    r"does not run on inputs as the card declares them, \{'scan': \(1, 2, 32, 1024\)\}: .*Expected: 2": _of_two_scans,
+    "cannot open the graph: .*PPScatter": lambda model: setattr(model.graph.node[0], "op_type", "PPScatterPlugin"),
+    r"does not run on inputs as the card declares them, \{'scan': \(1, 2, 32, 1024\)\}: .*Expected: 2": (
+        lambda model: setattr(model.graph.input[0].type.tensor_type.shape.dim[0], "dim_value", 2)
+    ),
 }
 
 
@@ -1073,7 +1067,13 @@ def test_weights_that_stayed_elsewhere_and_a_card_that_is_no_text_are_told_of(
     shell.out(*command)
     (tmp_path / "weights").unlink()
     assert "network.onnx keeps weights in another file, which cannot be read" in shell.err(*command)
-    command = card_command(tmp_path, path, card)
+    assert "card.json is not an ONNX model" in shell.err("card", tmp_path / "card.json", path, tmp_path / "out.onnx")
+    model = onnx.load(path)
+    model.training_info.add()
+    onnx.save(model, tmp_path / "network.onnx")
+    shell.out(*command)
+    with pytest.raises(ModelFileError, match=r"holds graphs for training; .*--trusted to edgeperc run"):
+        Session(tmp_path / "out.onnx", "cpu")
     (tmp_path / "card.json").write_bytes('{"name": "é"}'.encode("latin-1"))
     assert "card.json: 'utf-8' codec can't decode byte 0xe9" in shell.err(*command)
 
@@ -1082,11 +1082,9 @@ def test_weights_have_the_terms_of_their_scans() -> None:
     assert terms_of(sets_of([])) == ""
     assert terms_of(sets_of(["pandaset/002_00", "pandaset/002_01"])).startswith("CC BY 4.0")
     assert terms_of(sets_of(["lyft/7", "000001"])) == "KITTI: CC BY-NC-SA 3.0; Lyft Level 5: CC BY-NC-SA 4.0"
-    both = terms_of(sets_of(["pandaset/002_00", "000001"]))
-    assert both.startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
+    assert terms_of(sets_of(["pandaset/002_00", "1"])).startswith("KITTI: CC BY-NC-SA 3.0; CC BY 4.0, as PandaSet's")
     assert terms_of(sets_of(["mine/1"])) == "mine: terms of that set"
-    both = terms_of(sets_of(["0001TP_000001", "yard/1"], camera=True))
-    assert both.endswith("; images of another set: terms of that set")
+    assert terms_of(sets_of(["0001TP_1", "yard/1"], camera=True)).endswith("; images of another set: terms of that set")
 
 
 @pytest.mark.usefixtures("small_views")
@@ -1101,8 +1099,7 @@ def test_the_command_line_from_scans_to_a_model(tmp_path: Path, shell: Shell) ->
     arguments = ["--steps", "1", "--batch", "1", "--threads", "1", "--edge"]
     shell.out("train", "pointseg", run, "--simulated", data, *arguments)
     assert "parity" in shell.out("export", run / "checkpoint.pt", model)
-    shown = shell.out("verify", run / "checkpoint.pt", model)
-    assert '"n_scans": 4' in shown
+    assert '"n_scans": 4' in shell.out("verify", run / "checkpoint.pt", model)
     said = shell.err("verify", run / "checkpoint.pt", "pointseg")
     assert "pointseg.onnx is of another network or other options than" in said
     assert Session(model, "cpu").card.fitness is not None
@@ -1155,6 +1152,19 @@ def test_the_models_page_matches_the_cards() -> None:
     folder = REPOSITORY / "models"
     assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
     assert (folder / "SHA256SUMS").read_text() == sums_of(folder), "run: edgeperc-export models models"
+
+
+def test_a_page_of_own_models_says_nothing_of_the_shipped_ones(tmp_path: Path) -> None:
+    points = {"all": {"car": {"precision": 0.5, "recall": 0.5, "iou": 0.25, "n_points": 7}}}
+    metrics = {"command": "edgeperc eval MINE --json f.json", "folders": {"mine": {"n_frames": 2, "points": points}}}
+    own = replace(tiny_card(), metrics=metrics, precisions={"fp32": {"command": "edgeperc-export agree mine"}})
+    for card in (own, pillars.card_of("anchors")):
+        entry = {"key": CARD_KEY, "value": card.to_json()}
+        onnx.save(onnx.ModelProto(metadata_props=[entry]), tmp_path / f"{card.name}.onnx")
+    page = models_page(tmp_path)
+    expected = "| points, 2 scans of mine |", "by `edgeperc eval MINE --json f.json`\n", "64 x 64 cells of 0.4 m"
+    assert [words in page for words in expected] == [True] * 3
+    assert not [words for words in ("drive_0011", "Research", "Precision", "NAME:int8") if words in page]
 
 
 def test_parity_scans_are_no_training_scans(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,6 +60,7 @@ def test_every_option_has_a_help_text() -> None:
         ("train pointseg out --simulated scanz", "scanz holds no simulated scan; expected a folder written by"),
         ("train pointseg out --classes car,pedestrian", "--classes begins with car; expected background"),
         ("train camseg out --image-width 50", "expected multiples of 4 as --image-width and --image-height"),
+        ("export no.pt no.onnx --metrics /dev/null", "/dev/null has no figures, as edgeperc eval --json writes them"),
         # Numbers that no run can be made with
         ("train pointseg out --steps 0", "--steps is 0; expected 1 or more"),
         ("train pointseg out --swap nan", "--swap is nan; expected 0 to 1"),
