@@ -1,6 +1,6 @@
 """How far the predicted places of tracks are from where their objects are then (`Track.predicted`).
 
-Only objects faster than `ClassParameters.moving_mps` are counted: that one stands still is easily predicted. Places are
+Only objects faster than `Track.moving_mps` are counted: that one stands still is easily predicted. Places are
 compared in the frame of `Tracks.T_world_sensor`, which the tracker estimates, so its errors count, too.
 """
 
@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Sequence
 
-from ..tracking.tracks import AHEAD_S, PARAMETERS, Tracks
+from ..tracking.tracks import AHEAD_S, Tracks
 from .headings import FRAME_S, matches, places
 from .tracking_metrics import FrameTruth
 
@@ -30,12 +30,11 @@ def count_predictions(
     counted: dict[str, Counter[str]] = {f"{ahead_s:g} s": Counter(dict.fromkeys(COUNTS, 0)) for ahead_s in AHEAD_S}
     for k, i, row in matches(truth, tracks, labels, iou_threshold):
         one, track = int(truth[k].ids[i]), tracks[k][row]
-        slowest_mps = PARAMETERS.get(track.label, PARAMETERS["car"]).moving_mps
         for ahead_s, (name, counts) in zip(AHEAD_S, counted.items(), strict=True):
             later = k + round(ahead_s / FRAME_S)
             if later >= len(at) or one not in at[later]:
                 continue
-            if math.dist(at[k][one], at[later][one]) <= slowest_mps * ahead_s:
+            if math.dist(at[k][one], at[later][one]) <= track.moving_mps * ahead_s:
                 continue
             predicted = track.predicted(ahead_s, world=True).center[:2]
             straight = track.world_velocity[:2] * ahead_s + track.world_box.center[:2]

@@ -15,7 +15,6 @@ from ..types.choices import VEHICLES
 from ..types.perception import Box, Perception, scan_of
 from ..types.points import Floats, Mask, Points, as_points, read_only
 from . import Track
-from .tracks import PARAMETERS
 
 MOVABLE = frozenset(
     {
@@ -39,7 +38,7 @@ def moving_tracks(
     tracks: Iterable[Track], *, min_speed_mps: float | None = None, n_sigmas: float = 3.0
 ) -> tuple[Track, ...]:
     """The tracks that move over ground, in their order, faster than ``min_speed_mps`` (by default
-    `ClassParameters.moving_mps`) and than ``n_sigmas`` standard deviations of their speed.
+    `Track.moving_mps`) and than ``n_sigmas`` standard deviations of their speed.
 
     A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
     """
@@ -47,7 +46,7 @@ def moving_tracks(
         OPTIONS.number(name, value, 0.0)
     found = []
     for track in tracks:
-        slowest = PARAMETERS.get(track.label, PARAMETERS["car"]).moving_mps if min_speed_mps is None else min_speed_mps
+        slowest = track.moving_mps if min_speed_mps is None else min_speed_mps
         speed, sigma = abs(float(track.state[2])), math.sqrt(max(float(track.covariance[2, 2]), 0.0))
         if speed > max(slowest, n_sigmas * sigma):
             found.append(track)

@@ -229,8 +229,8 @@ class Tracker:
             raise TrackingError(f"T_world_sensor has {np.abs(pose).max():g}; expected at most {FARTHEST_M:g} m")
         self._warn_of(step, stamp_s)
         if step == "late":
-            nothing, pose = np.zeros(0, lives.TRACK), session.T_world_sensor.copy()
-            late = Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
+            nothing, pose, n = np.zeros(0, lives.TRACK), session.T_world_sensor.copy(), len(session.tracks)
+            late = Tracks(nothing, self._labels, self.class_table, stamp_s, pose, n, 0, session.number, is_late=True)
             self._clock = clock
             return late
         kinds = self.kinds_of(names)
@@ -273,8 +273,8 @@ class Tracker:
         strongest_first = np.argsort(-strength, kind="stable")
         lives.mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
-        shown, number = tracks[reported], session.number
-        answer = Tracks(shown, self._labels, stamp_s, pose.copy(), n_tentative, n_approximated, number)
+        named, number = (tracks[reported], self._labels, self.class_table), session.number
+        answer = Tracks(*named, stamp_s, pose.copy(), n_tentative, n_approximated, number)
         session = _Session(number, stamp_s, posed, tracks, pose, twist, twist_variances)
 
         # Last, and without a call in between, so that an update that a signal ends can be repeated.

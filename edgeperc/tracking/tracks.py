@@ -150,6 +150,8 @@ class Track:
         Whether it was not detected in this scan.
     T_world_sensor : (4, 4) float64
         Pose of the sensor at this scan, as in `Tracks`.
+    moving_mps : float
+        Speed above which it counts as moving, of the `ClassParameters` of the tracker [m/s].
     """
 
     id: int
@@ -165,6 +167,7 @@ class Track:
     hits: int
     coasting: bool
     T_world_sensor: Floats
+    moving_mps: float
 
     @property
     def world_velocity(self) -> Floats:
@@ -269,6 +272,7 @@ class Tracks(Sequence[Track]):
         self,
         rows: Records,
         labels: Sequence[str],
+        classes: Records,
         stamp_s: float,
         T_world_sensor: Floats,
         n_tentative: int = 0,
@@ -277,7 +281,7 @@ class Tracks(Sequence[Track]):
         *,
         is_late: bool = False,
     ) -> None:
-        self._rows, self._labels = rows, labels
+        self._rows, self._labels, self._classes = rows, labels, classes
         self._made: list[Track | None] = [None] * len(rows)  # the same object each time, so that `in` finds a track
         self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
         self.n_tentative, self.n_approximated = n_tentative, n_approximated
@@ -335,6 +339,7 @@ class Tracks(Sequence[Track]):
             hits=int(row["hits"]),
             coasting=bool(row["misses"] > 0),
             T_world_sensor=self.T_world_sensor,
+            moving_mps=float(self._classes["moving_mps"][row["label"]]),
         )
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import twins.moving
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks
 from edgeperc.tracking.moving import mark_in_boxes, movable_points, moving_points, moving_tracks
+from edgeperc.tracking.tracks import PARAMETERS
 from scenes import box
 
 PLACES = st.one_of(st.integers(-12, 12).map(lambda n: n / 2.0), st.sampled_from([math.nan, math.inf, -math.inf]))
@@ -45,9 +46,11 @@ def perceived(n: int, boxes: Any = (), labels: PointLabels | None = None) -> Per
 car = partial(box, score=0.99)
 
 
-def followed(*ways: Any, n: int = 20, ego_mps: float = 0.0, poses: bool = True, label: str = "car") -> Tracks:
+def followed(
+    *ways: Any, n: int = 20, ego_mps: float = 0.0, poses: bool = True, label: str = "car", parameters: Any = None
+) -> Tracks:
     """Tracks of cars after ``n`` scans, each way a function from the time to x, y over ground."""
-    tracker = Tracker()
+    tracker = Tracker(parameters)
     for k in range(n):
         t, pose = 0.1 * k, np.eye(4)
         pose[0, 3] = ego_mps * t
@@ -87,8 +90,12 @@ def test_a_speed_must_exceed_its_uncertainty_and_the_least_speed() -> None:
     state[2] = -0.8
     backward = replace(track, state=state, covariance=np.zeros((5, 5)))
     assert moving_tracks([backward]) == ()  # slower than a car's 1 m/s, not than a pedestrian's 0.7 m/s
-    assert len(moving_tracks([replace(backward, label="pedestrian")])) == 1
-    assert moving_tracks([replace(backward, label="forklift")]) == ()
+    own = {"forklift": replace(PARAMETERS["car"], moving_mps=0.3)}
+    limits = [("car", None, 1.0), ("pedestrian", None, 0.7), ("forklift", None, 1.0), ("forklift", own, 0.3)]
+    for label, parameters, moving_mps in limits:
+        (each,) = followed(*way, label=label, parameters=parameters)
+        assert each.moving_mps == moving_mps
+        assert len(moving_tracks([replace(backward, moving_mps=each.moving_mps)])) == (moving_mps < 0.8)
 
 
 def test_what_stands_is_not_marked() -> None:
