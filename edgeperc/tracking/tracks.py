@@ -196,16 +196,18 @@ class Track:
         """
         OPTIONS.number("ahead_s", ahead_s, 0.0, 60.0)
         _, _, speed, heading, turn_rate = self.state.tolist()
-        turn = turn_rate * ahead_s
-        chord_m, along = speed * ahead_s * float(np.sinc(turn / math.tau)), heading + turn / 2.0
-        shift = np.array([chord_m * math.cos(along), chord_m * math.sin(along), 0.0])
-        yaw = wrapped(self.world_box.yaw + turn)
+        half = 0.5 * turn_rate * ahead_s
+        chord_m = speed * ahead_s * (math.sin(half) / half if half else 1.0)
+        dx, dy = chord_m * math.cos(heading + half), chord_m * math.sin(heading + half)
+        yaw = wrapped(self.world_box.yaw + 2.0 * half)
         if world:
-            return replace(self.world_box, center=(*np.add(self.world_box.center, shift).tolist(),), yaw=float(yaw))
-        R = self.T_world_sensor[:3, :3]
-        ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0]) @ R
-        center = np.add(self.box.center, shift @ R)
-        return replace(self.box, center=(*center.tolist(),), yaw=math.atan2(ahead[1], ahead[0]))
+            x, y, z = self.world_box.center
+            return replace(self.world_box, center=(x + dx, y + dy, z), yaw=yaw)
+        x, y, z = self.box.center
+        (a, b, c), (d, e, f) = self.T_world_sensor[:2, :3].tolist()  # numpy would take four times as long
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        center = x + a * dx + d * dy, y + b * dx + e * dy, z + c * dx + f * dy
+        return replace(self.box, center=center, yaw=math.atan2(b * cos + e * sin, a * cos + d * sin))
 
     @property
     def center(self) -> tuple[float, float, float]:
@@ -234,7 +236,9 @@ class Track:
             "hits": self.hits,
             "coasting": self.coasting,
             "modes": {name: round(share, 4) for name, share in self.modes.items()},
-            "predicted": [[*box["center"], box["yaw"]] for box in (self.predicted(s).to_dict() for s in AHEAD_S)],
+            "predicted": [
+                [*(round(v, 4) for v in box.center), round(box.yaw, 5)] for box in map(self.predicted, AHEAD_S)
+            ],
         }
 
 
