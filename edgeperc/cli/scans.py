@@ -223,7 +223,8 @@ def find_sensor(paths: Iterable[Path], arguments: argparse.Namespace) -> SensorE
     from ..preprocess.sensor_estimate import MOST_SCANS, has_enough_points
     from ..readers.captures import is_capture, read_scans
 
-    scans, damage = list["Floats32"](), None
+    scans: list[Floats32] = []
+    damage: Exception | None = None
     for path in islice(paths, _LOOKED_AT):
         try:
             how = reading_options(path, arguments) | ({"origin_m": None} if is_capture(path) else {})

@@ -7,7 +7,7 @@ which the tracker estimates.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -66,15 +66,15 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[Floats
 
 
 def count_headings(
-    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
+    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], matched: Iterable[tuple[int, int, int]]
 ) -> dict[str, Counter[str]]:
-    """`COUNTS` of one sequence by `MOTIONS`, of tracks of ``labels`` whose 3-D IoU with a label is large enough."""
+    """`COUNTS` of one sequence by `MOTIONS`, of the pairs of `matches`."""
     counted = {motion: Counter(dict.fromkeys(COUNTS, 0)) for motion in MOTIONS}
     speeds_mps, met = speeds(truth, tracks), set()
     first = {}  # frame in which an object moves first
     for k in reversed(range(len(truth))):
         first.update(dict.fromkeys(truth[k].ids[speeds_mps[k] > MOVING_MPS].tolist(), k))
-    for k, i, track in matches(truth, tracks, labels, iou_threshold):
+    for k, i, track in matched:
         speed, tracked = speeds_mps[k][i], tracks[k]
         if np.isnan(speed):
             continue

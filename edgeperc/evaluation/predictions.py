@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 
 from ..tracking.tracks import AHEAD_S, Tracks
-from .headings import FRAME_S, matches, places
+from .headings import FRAME_S, places
 from .tracking_metrics import FrameTruth
 
 COUNTS = (
@@ -23,12 +23,12 @@ COUNTS = (
 
 
 def count_predictions(
-    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
+    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], matched: Iterable[tuple[int, int, int]]
 ) -> dict[str, Counter[str]]:
-    """`COUNTS` of one sequence by time ahead (``"1 s"``), of tracks of ``labels`` that match a label in their frame."""
+    """`COUNTS` of one sequence by time ahead (``"1 s"``), of the pairs of `headings.matches`."""
     at, met = places(truth, tracks), set()
     counted: dict[str, Counter[str]] = {f"{ahead_s:g} s": Counter(dict.fromkeys(COUNTS, 0)) for ahead_s in AHEAD_S}
-    for k, i, row in matches(truth, tracks, labels, iou_threshold):
+    for k, i, row in matched:
         one, track = int(truth[k].ids[i]), tracks[k][row]
         for ahead_s, (name, counts) in zip(AHEAD_S, counted.items(), strict=True):
             later = k + round(ahead_s / FRAME_S)

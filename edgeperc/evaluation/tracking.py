@@ -25,7 +25,7 @@ from ..types.choices import VEHICLES
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Mask
 from .ab3dmot import SETTINGS, Ab3dmot
-from .headings import FRAME_S, count_headings
+from .headings import FRAME_S, count_headings, matches
 from .judge import check_unseen, training_scans_of
 from .metrics import box_rows
 from .predictions import count_predictions
@@ -367,9 +367,9 @@ def evaluate_kitti(
             for method, reported in results.items():
                 pair = true, _frame_tracks(sequence, reported, label, rules)
                 pairs.setdefault((method, label), []).append(pair)
+            matched = [*matches(sequence.truth[label], tracks, KINDS[label], iou_threshold)]
             for counters, count in ((headings, count_headings), (predictions, count_predictions)):
-                counted = count(sequence.truth[label], tracks, KINDS[label], iou_threshold)
-                for name_of, counts in counted.items():
+                for name_of, counts in count(sequence.truth[label], tracks, matched).items():
                     counters[label].setdefault(name_of, Counter()).update(counts)
         if on_sequence is not None:
             on_sequence(done, len(names))
