@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
     from .road.rolling import RollingGrid
-    from .tracking import Track, Tracker, Tracks
+    from .tracking import Track, Tracker, Tracks, smooth_tracks
     from .tracking.moving import movable_points, moving_points
     from .tracking.zones import Crossing, Line, Zone
     from .types.card import ModelCard
@@ -152,6 +152,7 @@ __all__ = [
     "road_ahead",
     "sensor_of",
     "sensors",
+    "smooth_tracks",
     "stream",
 ]
 
@@ -171,7 +172,7 @@ _NAMES = {
     "road.ahead": ("FreeAhead", "RoadAhead", "free_ahead", "road_ahead"),
     "road.grid": ("OccupancyGrid", "occupancy_grid"),
     "road.rolling": ("RollingGrid",),
-    "tracking": ("Track", "Tracker", "Tracks"),
+    "tracking": ("Track", "Tracker", "Tracks", "smooth_tracks"),
     "tracking.moving": ("movable_points", "moving_points"),
     "tracking.zones": ("Crossing", "Line", "Zone"),
     "types.card": ("ModelCard",),

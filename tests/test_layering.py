@@ -57,6 +57,7 @@ FLOORS = {
         tracking.egomotion tracking.lives
         tracking.tracks
         tracking.tracker
+        tracking.smoothing
         tracking.__init__
         tracking.moving tracking.zones
         zoo.__init__

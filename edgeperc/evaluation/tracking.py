@@ -19,6 +19,7 @@ from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects, wrong_i
 from ..errors import TrackingError
 from ..perceiver import Perceiver
 from ..readers.files import read_points
+from ..tracking.smoothing import smooth_tracks
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import Tracks
 from ..types.choices import VEHICLES
@@ -230,8 +231,10 @@ def _read_detections(
     return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
 
 
-def track_sequence(sequence: TrackingSequence) -> tuple[list[Tracks], float]:
-    """Run a new `edgeperc.Tracker` over a sequence, without poses: the tracks by frame, and the seconds it took."""
+def track_sequence(sequence: TrackingSequence, *, smooth: bool = False) -> tuple[list[Tracks], float]:
+    """Run a new `edgeperc.Tracker` over a sequence, without poses: the tracks by frame, smoothed when it is over if
+    asked, and the seconds it took.
+    """
     # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
     edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
@@ -240,7 +243,8 @@ def track_sequence(sequence: TrackingSequence) -> tuple[list[Tracks], float]:
     start = time.perf_counter()
     for k, boxes in enumerate(sequence.detections):
         tracks.append(tracker.update(boxes, k * FRAME_S))
-    return tracks, time.perf_counter() - start
+    seconds = time.perf_counter() - start
+    return smooth_tracks(tracks) if smooth else tracks, seconds
 
 
 def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSES) -> list[FrameResult]:
@@ -303,6 +307,7 @@ def evaluate_kitti(
     boxes: Mapping[str, Sequence[Sequence[Box]]] | None = None,
     iou_threshold: float = 0.25,
     rules: str = RULES[0],
+    smooth: bool = False,
     rival: bool = False,
     on_sequence: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -323,6 +328,8 @@ def evaluate_kitti(
         Smallest 3-D IoU of a match.
     rules : str
         Of `RULES`.
+    smooth : bool
+        Whether to smooth the tracks of each sequence when it is over (`edgeperc.smooth_tracks`).
     rival : bool
         Whether to evaluate AB3DMOT's method too, with the same boxes and rules.
     on_sequence : callable, optional
@@ -331,8 +338,8 @@ def evaluate_kitti(
     Returns
     -------
     dict
-        For JSON: ``sequences``, ``iou_threshold``, ``rules``, ``frames_per_s``; in ``classes`` the `TrackingScores` of
-        each; in ``headings`` and ``predictions`` the counts of `edgeperc.evaluation.headings` and
+        For JSON: ``sequences``, ``iou_threshold``, ``rules``, ``smooth``, ``frames_per_s``; in ``classes`` the
+        `TrackingScores` of each; in ``headings`` and ``predictions`` the counts of `edgeperc.evaluation.headings` and
         `edgeperc.evaluation.predictions` of each; with ``rival``, in ``rival`` the `TrackingScores` of AB3DMOT's
         method.
 
@@ -355,7 +362,7 @@ def evaluate_kitti(
     n_frames, seconds = 0, 0.0
     for done, name in enumerate(names, start=1):
         sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
-        tracks, took = track_sequence(sequence)
+        tracks, took = track_sequence(sequence, smooth=smooth)
         n_frames, seconds = n_frames + len(tracks), seconds + took
         results = {"edgeperc": [FrameResult.of(in_frame) for in_frame in tracks]}
         if rival:
@@ -368,7 +375,10 @@ def evaluate_kitti(
                 pair = true, _frame_tracks(sequence, reported, label, rules)
                 pairs.setdefault((method, label), []).append(pair)
             matched = [*matches(sequence.truth[label], tracks, KINDS[label], iou_threshold)]
-            for counters, count in ((headings, count_headings), (predictions, count_predictions)):
+            counted = [(headings, count_headings)]
+            if not smooth:  # what is known in hindsight predicts nothing
+                counted.append((predictions, count_predictions))
+            for counters, count in counted:
                 for name_of, counts in count(sequence.truth[label], tracks, matched).items():
                     counters[label].setdefault(name_of, Counter()).update(counts)
         if on_sequence is not None:
@@ -380,6 +390,7 @@ def evaluate_kitti(
         "sequences": names,
         "iou_threshold": iou_threshold,
         "rules": rules,
+        "smooth": smooth,
         "frames_per_s": n_frames / seconds,
         "classes": scores["edgeperc"],
         "headings": headings,

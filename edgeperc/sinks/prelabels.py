@@ -7,13 +7,14 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..camera.calibration import level_heading, read_kitti_calibration, warn_off_center
-from ..errors import CalibrationError, OptionError
+from ..errors import CalibrationError, EdgepercError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
 from ..types.choices import VEHICLES
@@ -22,6 +23,9 @@ from ..types.perception import Box
 from ..types.points import Floats
 from ..view.content import edges_ahead
 from .run_file import RunFile, ScanFiles, stem_of, warn_of
+
+if TYPE_CHECKING:
+    from ..tracking.tracks import Track, Tracks
 
 __all__ = ["KINDS", "PrelabelSink", "cvat_cuboid"]
 
@@ -44,11 +48,22 @@ Named = tuple[Box, "int | None"]
 """A box and the id of its track."""
 
 
+class _Item(NamedTuple):
+    """What labels need of a scan."""
+
+    name: str
+    boxes: tuple[Box, ...]
+    origin_m: tuple[float, float, float] | None
+    image_size: tuple[int, int] | None  # width and height [px] of an image that was perceived with it
+
+
 class PrelabelSink:
     """Writes the boxes of each scan as a tool's own labels.
 
-    With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
-    the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
+    With tracks, these are the tracks with their ids, smoothed when the drive is over (`edgeperc.smooth_tracks`), from
+    the first to the last scan that an object was detected in; nothing is written of a drive that does not end. Those of
+    a live source are written at once, where they were detected. Without tracks, and of late scans, these are the boxes
+    of the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
     place there is known (``origin_m``); KITTI's are in the frame of the camera, where ``calib/NAME.txt`` puts
     these points. A scan without boxes gets an empty file. Labels that are there and differ stay: perhaps the truth.
 
@@ -86,9 +101,10 @@ class PrelabelSink:
         if calib is not None and kind != "kitti":
             raise OptionError(f"labels for {kind} need no calibration; leave it out, or choose kitti")
         self._folder, self._kind = Path(folder), kind
-        self._writer: Callable[[str, PerceivedScan, Sequence[Named]], None] = getattr(self, f"_{kind}")
+        self._writer: Callable[[str, _Item, Sequence[Named]], None] = getattr(self, f"_{kind}")
         self._calib = None if calib is None else Path(calib)
         self._files = ScanFiles()
+        self._drive: list[tuple[_Item, Tracks]] = []  # of the scans whose tracks go on
         self._stack = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         settings = self._folder / "labels/_classes.json"
@@ -104,19 +120,59 @@ class PrelabelSink:
             self._document.write(b'{"info": {}, "items": [')
 
     def write(self, scan: PerceivedScan) -> None:
-        """Write the labels of one scan. Raises OptionError if another one has its name, CalibrationError, OSError."""
-        boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
-        if scan.tracked is not None:
-            boxes = [(track.box, track.id) for track in scan.tracked if not track.coasting]
-        if scan.perception.origin_m is not None and self._kind != "kitti":
-            placed = scan.perception.in_map(box for box, _ in boxes)
-            boxes = [(box, number) for box, (_, number) in zip(placed, boxes, strict=True)]
+        """Write the labels of one scan, or of the drive that ended before it. Raises OptionError if another scan has
+        its name, CalibrationError, OSError.
+        """
+        image = scan.perception.image
+        size = None if image is None else (image.labels.shape[1], image.labels.shape[0])
+        item = _Item(scan.name, scan.perception.boxes, scan.perception.origin_m, size)
+        if scan.tracks is None or scan.health is not None:
+            tracked = None if scan.tracked is None else [track for track in scan.tracked if not track.coasting]
+            self._write_boxes(item, tracked)
+            return
+        former: list[tuple[_Item, Tracks]] = []
+        if self._drive and scan.tracks.session != self._drive[-1][1].session:
+            former, self._drive = self._drive, []
+        self._drive.append((item, scan.tracks))
+        if former:
+            self._write_drive(former)
+
+    def _write_drive(self, drive: Sequence[tuple[_Item, Tracks]]) -> None:
+        """Write the labels of a drive that is over; raise the first error when all are written."""
+        from ..tracking.smoothing import smooth_tracks  # it loads numba
+
+        errors = []
+        for (item, _), tracks in zip(drive, smooth_tracks(tracks for _, tracks in drive), strict=True):
+            try:
+                self._write_boxes(item, None if tracks.is_late else tracks)
+            except (EdgepercError, OSError) as exc:
+                errors.append(exc)
+        if errors:
+            more = f"; and {len(errors) - 1} more" if len(errors) > 1 else ""
+            raise type(errors[0])(f"{errors[0]}{more}") from errors[0]
+
+    def _write_boxes(self, item: _Item, tracks: Sequence[Track] | None) -> None:
+        boxes: list[Named] = [(box, None) for box in item.boxes]
+        if tracks is not None:
+            boxes = [(track.box, track.id) for track in tracks]
+        if item.origin_m is not None and self._kind != "kitti":
+            x, y, z = item.origin_m
+            places = [(box.center[0] + x, box.center[1] + y, box.center[2] + z) for box, _ in boxes]
+            boxes = [(replace(box, center=place), number) for (box, number), place in zip(boxes, places, strict=True)]
         for box, _ in boxes:
             self._number(box.label)
-        self._writer(stem_of(scan.name)[0], scan, boxes)
+        self._writer(stem_of(item.name)[0], item, boxes)
 
     def close(self, whole: bool = True) -> None:
-        """Finish the files that are of all scans; see `Sink.close`."""
+        """Finish the labels of the last drive, and the files that are of all scans; see `Sink.close`."""
+        drive, self._drive = self._drive, []
+        try:
+            if drive and whole:
+                self._write_drive(drive)
+        finally:
+            self._finish(whole)
+
+    def _finish(self, whole: bool) -> None:
         if self._kind == "labelcloud":
             classes = [*self._classes.values()]
             document = {"classes": classes, "default": classes[0]["id"], "type": "object_detection", "format": _FORM}
@@ -139,7 +195,7 @@ class PrelabelSink:
             self._classes[name] = {"name": name, "id": new, "color": _COLORS[new % len(_COLORS)]}
         return int(self._classes[name]["id"])
 
-    def _labelcloud(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+    def _labelcloud(self, name: str, scan: _Item, boxes: Sequence[Named]) -> None:
         source = Path(scan.name)
         objects = [
             {
@@ -153,7 +209,7 @@ class PrelabelSink:
         document = {"folder": source.parent.name, "filename": source.name, "path": scan.name, "objects": objects}
         self._write(f"labels/{name}.json", scan.name, _json(document))
 
-    def _sustechpoints(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+    def _sustechpoints(self, name: str, scan: _Item, boxes: Sequence[Named]) -> None:
         document = [
             {
                 "obj_id": "" if number is None else str(number),
@@ -168,7 +224,7 @@ class PrelabelSink:
         ]
         self._write(f"label/{name}.json", scan.name, _json(document))
 
-    def _cvat(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+    def _cvat(self, name: str, scan: _Item, boxes: Sequence[Named]) -> None:
         self._files.checked(self._folder / name, scan.name)
         now = {number: box for box, number in boxes if number is not None}
         # CVAT keeps a track to the end of the task, unless a box says that it is outside.
@@ -194,15 +250,15 @@ class PrelabelSink:
         self._before = now
         self._file.check()
 
-    def _kitti(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+    def _kitti(self, name: str, scan: _Item, boxes: Sequence[Named]) -> None:
         T_cam_sensor, P2, text, size = _NOMINAL_TR, _NOMINAL_P2, "", _IMAGE_SIZE
         if self._calib is not None:
-            path, image = calibration_of(self._calib, scan.name), scan.perception.image
+            path = calibration_of(self._calib, scan.name)
             T_cam_sensor, P2 = read_kitti_calibration(path)
-            size = size if image is None else (image.labels.shape[1], image.labels.shape[0])
+            size = scan.image_size or size
             warn_off_center(P2, *size, "2-D boxes are cut to it. Pass the scans as --scan of their images")
             text = path.read_text("utf-8") if path.is_file() else ""
-        origin, T_cam_file = scan.perception.origin_m, T_cam_sensor.copy()
+        origin, T_cam_file = scan.origin_m, T_cam_sensor.copy()
         T_cam_file[:3, 3] -= T_cam_sensor[:3, :3] @ (origin or (0.0, 0.0, 0.0))
         if origin or not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
             rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_file[:3]}

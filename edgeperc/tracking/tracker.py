@@ -242,8 +242,8 @@ class Tracker:
         if len(memory_s) and dt > memory_s.max():
             self._warn_of("pause", stamp_s)
         of = self.class_table[tracks["label"]]
-        predictions = _predictions(tracks, of, dt)
-        state, covariance = _combined(*predictions)
+        predictions = predict(mix(tracks, of, dt), of, dt)
+        state, covariance = combine(*predictions)
         twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
             # Vehicles that may stand are taken to: nothing else corrects a speed that they and the sensor share.
@@ -274,7 +274,7 @@ class Tracker:
         lives.mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
         named, number = (tracks[reported], self._labels, self.class_table), session.number
-        answer = Tracks(*named, stamp_s, pose.copy(), n_tentative, n_approximated, number)
+        answer = Tracks(*named, stamp_s, pose.copy(), n_tentative, n_approximated, number, every=tracks)
         session = _Session(number, stamp_s, posed, tracks, pose, twist, twist_variances)
 
         # Last, and without a call in between, so that an update that a signal ends can be repeated.
@@ -393,19 +393,25 @@ def _leveled(mounting: Mounting) -> Floats:
     return np.eye(3) if np.allclose(R, np.eye(3), atol=1e-9) else R
 
 
-def _predictions(tracks: Records, classes: Records, dt: float) -> Predictions:
-    """Interaction and prediction of each motion model."""
+def mix(tracks: Records, classes: Records, dt: float) -> Predictions:
+    """Interaction: where the filter of each motion model starts from."""
     n = len(tracks)
     mixed, mixed_covariances, prior = np.empty((n, 3, 5)), np.empty((n, 3, 5, 5)), np.empty((n, 3))
     stay = np.exp(-dt / classes["keep_motion_s"])
     states, covariances, modes = (tracks[field].copy() for field in ("states", "covariances", "modes"))
     fill_interaction(states, covariances, modes, stay, mixed, mixed_covariances, prior)
-    means, predicted = np.empty_like(mixed), np.empty_like(mixed_covariances)
-    fill_predictions(mixed, mixed_covariances, classes["noise"].copy(), dt, means, predicted)
+    return Predictions(mixed, mixed_covariances, prior)
+
+
+def predict(mixed: Predictions, classes: Records, dt: float) -> Predictions:
+    """Prediction of each motion model."""
+    states, covariances, prior = mixed
+    means, predicted = np.empty_like(states), np.empty_like(covariances)
+    fill_predictions(states, covariances, classes["noise"].copy(), dt, means, predicted)
     return Predictions(means, predicted, prior)
 
 
-def _combined(states: Floats, covariances: Floats, modes: Floats) -> tuple[Floats, Floats]:
+def combine(states: Floats, covariances: Floats, modes: Floats) -> tuple[Floats, Floats]:
     """Combination: state (n, 5) and covariance (n, 5, 5) of tracks over their motion models."""
     state, covariance = np.empty((len(states), 5)), np.empty((len(states), 5, 5))
     fill_combined(states, covariances, modes, state, covariance)
@@ -446,7 +452,7 @@ def _update_motion(
     states, covariances = np.empty_like(means), np.empty_like(predicted)
     fill_updates(means, predicted, places, sigmas, shares, states, covariances)
     tracks["states"], tracks["covariances"], tracks["modes"] = states, covariances, modes
-    tracks["state"], tracks["covariance"] = _combined(states, covariances, modes)
+    tracks["state"], tracks["covariance"] = combine(states, covariances, modes)
 
 
 def _update_shapes(tracks: Records, detections: Detections, beta: Floats, sigmas: Floats, dt: float) -> None:

@@ -13,7 +13,7 @@ from ..system.fields import OPTIONS
 from ..types.geometry import wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Ints64, Records
-from .lives import MOVED
+from .lives import MOVED, TRACK
 from .ukf import MODES
 
 # Lowest and highest value of those that may be 0 or below, and of shares: tracks would be lost without a word.
@@ -111,6 +111,7 @@ PARAMETERS: Mapping[str, ClassParameters] = {
     "cyclist": _CYCLIST,
 }
 AHEAD_S = (1.0, 2.0, 3.0)  # for which records and evaluations hold where a track will be
+_NONE = np.zeros(0, TRACK)
 DOUBT = 10.0  # scans with log odds 0 that are added to the mean in a track's score
 
 
@@ -284,8 +285,10 @@ class Tracks(Sequence[Track]):
         session: int = 0,
         *,
         is_late: bool = False,
+        every: Records = _NONE,
     ) -> None:
-        self._rows, self._labels, self._classes = rows, labels, classes
+        self.rows, self.class_names, self.class_table = rows, labels, classes
+        self.every = every  # tentative tracks, too, for `smooth_tracks`
         self._made: list[Track | None] = [None] * len(rows)  # the same object each time, so that `in` finds a track
         self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
         self.n_tentative, self.n_approximated = n_tentative, n_approximated
@@ -307,10 +310,10 @@ class Tracks(Sequence[Track]):
     @property
     def labels(self) -> list[str]:
         """The class of each track."""
-        return [self._labels[k] for k in self._rows["label"].tolist()]
+        return [self.class_names[k] for k in self.rows["label"].tolist()]
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     @overload
     def __getitem__(self, index: int) -> Track: ...
@@ -324,8 +327,8 @@ class Tracks(Sequence[Track]):
         return track
 
     def _track(self, index: int) -> Track:
-        row = self._rows[index]
-        label, score = self._labels[row["label"]], float(self.scores[index])
+        row = self.rows[index]
+        label, score = self.class_names[row["label"]], float(self.scores[index])
         front = None if math.isnan(self.fronts[index]) else float(self.fronts[index])
         state = row["state"].copy()
         heading = np.array([math.cos(state[3]), math.sin(state[3]), 0.0])
@@ -343,7 +346,7 @@ class Tracks(Sequence[Track]):
             hits=int(row["hits"]),
             coasting=bool(row["misses"] > 0),
             T_world_sensor=self.T_world_sensor,
-            moving_mps=float(self._classes["moving_mps"][row["label"]]),
+            moving_mps=float(self.class_table["moving_mps"][row["label"]]),
         )
 
 

@@ -272,6 +272,9 @@ def test_eval_tracking_prints_the_tables(kitti: Path, shell: Shell) -> None:
     assert figures["classes"]["cyclist"]["best"]["mota"] is None
     assert figures["command"].startswith("edgeperc eval-tracking")
     assert "no label_02" in shell.err("eval-tracking", kitti / "calib")
+    smoothed = shell.out("eval-tracking", kitti, "--smooth")
+    assert smoothed.startswith("1 sequence, given detections, 3-D IoU 0.25, rules edgeperc, smoothed;")
+    assert ("after a time" in "".join(lines), "after a time" in smoothed) == (True, False)  # it predicts nothing
 
 
 def test_a_models_boxes_are_evaluated(kitti: Path, shell: Shell) -> None:
@@ -380,7 +383,12 @@ def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_pat
 
 def test_real_sequences_are_tracked_well(data_root: Callable[[str], Path]) -> None:
     """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
-    figures = tracking.evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
+    figures, smoothed = (
+        tracking.evaluate_kitti(data_root("tracking"), sequences=["0004"], smooth=smooth)["classes"]["car"]
+        for smooth in (False, True)
+    )
+    assert smoothed["hota"]["hota"] > figures["hota"]["hota"] + 0.01
+    assert smoothed["all_tracks"]["n_missed"] < figures["all_tracks"]["n_missed"]
     assert figures["best"]["mota"] > 0.85
     assert figures["best"]["n_switches"] == 0
     assert figures["hota"]["hota"] > 0.6

@@ -262,6 +262,28 @@ def test_tracks_keep_their_ids_and_end(tmp_path: Path, kind: str) -> None:
         assert flags == [{1: False, 2: False}] * 4 + [{1: False, 2: True}] + [{1: False}] * 3
 
 
+@pytest.mark.filterwarnings("ignore:.*the clock jumped:UserWarning")
+def test_labels_of_a_drive_come_when_it_is_over(tmp_path: Path) -> None:
+    """Smoothed, and where a car was not detected for a scan, too; those of a live source come at once."""
+    tracker, sink, ahead = Tracker(), PrelabelSink(tmp_path, "sustechpoints"), (box("car", 12.0, 0.0, 0.0),)
+    places = [tmp_path / f"label/{k:06d}.json" for k in range(10)]
+    for k in range(9):
+        boxes = () if k == 4 else ahead
+        tracks = tracker.update(boxes, 0.1 * k + 100.0 * (k == 8), np.eye(4))
+        if k == 8:
+            assert not any(map(Path.exists, places))
+            places[2].parent.mkdir()
+            places[2].write_text("corrected by hand")
+            with pytest.raises(OptionError, match=r"000002\.json exists with other content"):
+                sink.write(perceived("000008.bin", boxes, tracks))
+        else:
+            sink.write(perceived(f"{k:06d}.bin", boxes, tracks))
+    assert [len(READERS["sustechpoints"](tmp_path, f"{k:06d}")) for k in range(8) if k != 2] == [1] * 7
+    sink.write(replace(perceived("000009.bin", ahead, tracks), health="OK"))
+    sink.close(whole=False)
+    assert [place.exists() for place in places[8:]] == [False, True]
+
+
 def test_kitti_labels_lie_in_the_image_of_their_camera(tmp_path: Path) -> None:
     calib = tmp_path / "calib.txt"
     calib.write_text(CALIBRATION)

@@ -367,3 +367,22 @@ def best_gain(gain: np.ndarray) -> float:
         (sum(padded[i, j] for i, j in enumerate(event)) for event in itertools.permutations(range(n + m), n)),
         default=0.0,
     )
+
+
+def retraced(track: Any, later: Any, of: Any, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Smoothed state and covariance of one track and its smoothed z, by one step back from those ``later``."""
+    means, covariances, prior = interaction(
+        track["states"], track["covariances"], track["modes"], math.exp(-dt / of["keep_motion_s"])
+    )
+    state, covariance = combination(means, covariances, prior)
+    ahead = [unscented_prediction(j, means[j], covariances[j], of["noise"], dt) for j in range(3)]
+    expected, spread = combination(np.array([a[0] for a in ahead]), np.array([a[1] for a in ahead]), prior)
+    cross, step = np.zeros((5, 5)), 1e-6
+    for j in range(3):
+        F = [(moved(j, means[j] + off, dt) - moved(j, means[j] - off, dt)) / (2 * step) for off in step * np.eye(5)]
+        cross += prior[j] * (covariances[j] @ np.array(F) + np.outer(means[j] - state, ahead[j][0] - expected))
+    gain = cross @ np.linalg.inv(spread)
+    share = track["shape_variance"][0] / (track["shape_variance"][0] + 0.25 * dt)
+    z = track["shape"][0] + share * (later["shape"][0] - track["shape"][0])
+    off = later["covariance"] - spread
+    return state + gain @ (later["state"] - expected), covariance + gain @ off @ gain.T, z

@@ -74,6 +74,9 @@ def add_parser(commands: Commands) -> None:
         default="edgeperc",
     )
     rules(
+        "--smooth", "smooth the tracks of each sequence when it is over, as for labels: later scans help earlier ones"
+    )
+    rules(
         "--rival METHOD",
         "evaluate AB3DMOT's method, implemented again, on the same boxes by the same rules (default: none)",
         choices=("ab3dmot",),
@@ -115,6 +118,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
             boxes=boxes,
             iou_threshold=arguments.iou,
             rules=arguments.rules,
+            smooth=arguments.smooth,
             rival=arguments.rival is not None,
             on_sequence=show,
         )
@@ -134,7 +138,7 @@ def _draw(arguments: argparse.Namespace, name: str, boxes: Mapping[str, list[lis
     from ...view.tracks import draw_tracks, flatten_scan
 
     sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
-    tracks, scans = track_sequence(sequence)[0], sequence_scans(arguments.root, name)
+    tracks, scans = track_sequence(sequence, smooth=arguments.smooth)[0], sequence_scans(arguments.root, name)
     under = [
         flatten_scan(read_points(scans[k]) if k in scans else np.empty((0, 4), np.float32))
         for k in range(len(tracks) if scans else 0)
@@ -202,7 +206,8 @@ def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
     ]
     return [
         f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}, rules "
-        f"{figures['rules']}; {figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
+        f"{figures['rules']}{', smoothed' * figures['smooth']}; {figures['frames_per_s']:,.0f} scans a second in the "
+        "tracker; shares in per cent",
         *table_lines("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
         *table_lines("counts at the best MOTA", _COUNT_COLUMNS, rows),
         *table_lines("counts of all tracks, with any score", _COUNT_COLUMNS, of_all),

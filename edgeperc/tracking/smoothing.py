@@ -1,0 +1,135 @@
+"""Tracks in hindsight: fixed-interval smoothing of a whole recording (Rauch, Tung and Striebel, 1965)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ..errors import TrackingError
+from ..types.points import Floats, Ints64, Records
+from .lives import TRACK, mark_rivals
+from .tracker import SHAPE_WALK_M, combine, mix, predict
+from .tracks import Tracks, strength_of
+from .ukf import CTRV, RANDOM_MOTION
+
+
+def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
+    """Estimate the tracks of a whole recording anew, at each scan from all scans: from those after it, too.
+
+    In hindsight a track begins with its first detection, ends with its last one, and goes on where none was between
+    them. Its places, headings and speeds are smoothed, and it has one class, one size and one front. What was never
+    reported stays out.
+
+    Parameters
+    ----------
+    recording : iterable of Tracks
+        What one `Tracker` returned, in this order.
+
+    Returns
+    -------
+    list of Tracks
+        One for each, with its time, pose, session and ids, and the scores that were known at its time.
+
+    Raises
+    ------
+    TrackingError
+        These are no `Tracks` of one recording in order, or were smoothed before.
+
+    Examples
+    --------
+    >>> tracker = Tracker()                                            # doctest: +SKIP
+    >>> online = [tracker(perception) for perception in perceptions]   # doctest: +SKIP
+    >>> for tracks in smooth_tracks(online):                           # doctest: +SKIP
+    ...     print(tracks.stamp_s, [track.box for track in tracks])
+    """
+    answers = list(recording)
+    if not all(isinstance(tracks, Tracks) and len(tracks.every) >= len(tracks) for tracks in answers):
+        raise TrackingError("got no Tracks, or smoothed ones; pass what a Tracker returned for each scan, as it was")
+    smoothed = list(answers)
+    reported = np.unique(np.concatenate([np.zeros(0, np.int64), *(tracks.ids for tracks in answers)]))
+    for session in {tracks.session for tracks in answers if not tracks.is_late}:
+        scans = [k for k, tracks in enumerate(answers) if tracks.session == session and not tracks.is_late]
+        for k, tracks in zip(scans, _smoothed([answers[k] for k in scans], reported), strict=True):
+            smoothed[k] = tracks
+    return smoothed
+
+
+def _smoothed(online: Sequence[Tracks], reported: Ints64) -> list[Tracks]:
+    """The scans of one session with those tracks that were ``reported`` at any time."""
+    names, class_table = online[-1].class_names, online[-1].class_table
+    after, after_s, found = np.zeros(0, TRACK), math.inf, []
+    for tracks in reversed(online):
+        if not tracks.stamp_s < after_s:
+            raise TrackingError(f"got a scan at {tracks.stamp_s} s before one at {after_s} s; expected one recording")
+        rows = tracks.every[np.isin(tracks.every["id"], reported)]
+        rows = rows[(rows["misses"] == 0) | np.isin(rows["id"], after["id"])]
+        goes_on = np.isin(rows["id"], after["id"])
+        later = after[np.isin(after["id"], rows["id"])]  # ids rise in every scan
+        rows[goes_on] = _retraced(rows[goes_on], later, class_table, after_s - tracks.stamp_s)
+        after, after_s = rows, tracks.stamp_s
+        found.append(rows)
+    smoothed = []
+    for tracks, rows in zip(online, reversed(_of_lives(found)), strict=True):
+        shown = np.ones(len(rows), np.bool_)
+        strongest_first = np.argsort(-strength_of(rows), kind="stable")
+        mark_rivals(rows["state"].copy(), rows["shape"].copy(), strongest_first, shown)
+        n_out = len(tracks) + tracks.n_tentative - int(shown.sum())
+        of_scan = tracks.stamp_s, tracks.T_world_sensor, n_out, tracks.n_approximated, tracks.session
+        smoothed.append(Tracks(rows[shown], names, class_table, *of_scan))
+    return smoothed
+
+
+def _of_lives(found: Sequence[Records]) -> list[Records]:
+    """Each track with one size, the mean by precision, and one front, by the mean of what its scans knew."""
+    every = np.concatenate(found)
+    number = np.unique(every["id"], return_inverse=True)[1]
+    precision = 1.0 / every["shape_variance"][:, 1:]
+    for values, weights in ((every["shape"][:, 1:], precision), (every["fronts"], np.ones_like(precision))):
+        for value, weight in zip(values.T, weights.T, strict=True):  # views
+            value[:] = (np.bincount(number, weight * value) / np.bincount(number, weight))[number]
+    return np.split(every, np.cumsum([len(rows) for rows in found])[:-1])
+
+
+def _retraced(tracks: Records, later: Records, class_table: Records, dt: float) -> Records:
+    """Tracks at a scan, from their estimates there and the smoothed ones ``later``, after ``dt`` [s]: with the gain
+    G = C P'^-1 of the predicted covariance P' and its covariance C with the state, x + G (x_later - x'), and
+    P + G (P_later - P') G^T.
+    """
+    of = class_table[tracks["label"]]
+    mixed = mix(tracks, of, dt)
+    moved = predict(mixed, of, dt)
+    (state, covariance), (expected, spread) = combine(*mixed), combine(*moved)
+    jacobians = _jacobians(mixed.means, dt)
+    by_mode = mixed.covariances @ jacobians.swapaxes(-1, -2)
+    by_mode += (mixed.means - state[:, None])[..., None] * (moved.means - expected[:, None])[..., None, :]
+    cross = np.einsum("nj,njab->nab", mixed.prior, by_mode)
+    gain = np.linalg.solve(spread, cross.swapaxes(-1, -2)).swapaxes(-1, -2)
+    result = tracks.copy()
+    result["state"] = state + (gain @ (later["state"] - expected)[..., None])[..., 0]
+    result["covariance"] = covariance + gain @ (later["covariance"] - spread) @ gain.swapaxes(-1, -2)
+    walked = tracks["shape_variance"] + SHAPE_WALK_M**2 * dt
+    share = tracks["shape_variance"] / walked
+    result["shape"] += share * (later["shape"] - tracks["shape"])
+    result["shape_variance"] += share**2 * (later["shape_variance"] - walked)
+    result["label"] = later["label"]
+    return result
+
+
+def _jacobians(states: Floats, dt: float) -> Floats:
+    """Derivatives (n, 3, 5, 5) of the predicted states by ``states`` (n, 3, 5), by motion model."""
+    speed, heading, turn = np.moveaxis(states[..., 2:], -1, 0)
+    half = 0.5 * np.where(np.arange(3) == CTRV, turn, 0.0) * dt
+    chord = np.sinc(half / math.pi) * dt  # of an arc driven with 1 m/s
+    cos, sin = np.cos(heading + half), np.sin(heading + half)
+    result = np.zeros((*states.shape, 5))
+    result[..., [0, 1, 3], [0, 1, 3]] = 1.0
+    result[..., 2, 2] = 1.0
+    result[..., 0, 2], result[..., 1, 2] = chord * cos, chord * sin
+    result[..., 0, 3], result[..., 1, 3] = -speed * chord * sin, speed * chord * cos
+    result[:, RANDOM_MOTION, :3, 2:4] = 0.0
+    # An arc's chord hardly changes with the turn rate; its direction does.
+    result[:, CTRV, :2, 4] = 0.5 * dt * result[:, CTRV, :2, 3]
+    result[:, CTRV, 3, 4], result[:, CTRV, 4, 4] = dt, 1.0
+    return result
