@@ -47,7 +47,8 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
     group("--movable", "with --static: leave out the points on everything that could move, too: vehicles and people")
     group(
         "--labels-for",
-        "write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
+        "write the boxes to --out as labels for an annotation tool; with --track those of tracks, smoothed when the "
+        "drive is over, with ids. kitti "
         "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one (default: none)",
         choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
     )
