@@ -86,6 +86,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Such a test runs interpreted and bounds-checked, too; ``@pytest.mark.kernel`` marks one that knows another truth,
     ``@pytest.mark.compiled`` one that runs compiled alone, for its kernels are held against their twins elsewhere.
     """
+    items.sort(key=lambda item: item.path.name != "test_warm_up.py")  # else one process ends 80 s after the others
     for item in items:
         function, module = getattr(item, "function", None), getattr(item, "module", None)
         if function is not None and module is not None and item.get_closest_marker("compiled") is None:
