@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -169,6 +170,9 @@ class PrelabelSink:
         try:
             if drive and whole:
                 self._write_drive(drive)
+            elif drive:
+                text = f"{len(drive)} scans of a drive that was stopped have no labels, which come when it is over"
+                warnings.warn(f"{self._folder}: {text}", RuntimeWarning, stacklevel=2)
         finally:
             self._finish(whole)
 
