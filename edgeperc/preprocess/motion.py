@@ -19,7 +19,7 @@ from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import fill_moved, pose_between, poses_of, quaternion
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
-from ..types.points import Floats, Floats32, Points, as_points, read_only
+from ..types.points import MAX_ROUNDING_M, Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import numbers_of, rigid, times_of
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
@@ -380,7 +380,8 @@ def merge(
     PointsError
         A scan is not points, or there is no scan.
     SensorError
-        There is not one pose for each scan, or one is not a rotation and a translation.
+        There is not one pose for each scan, or one is not a rotation and a translation, or puts its sensor so far away,
+        as in a map, that float32 would round its points by more than 5 mm.
     OptionError
         ``min_range_m`` is not one number of meters from 0, or one for each scan.
     """
@@ -395,6 +396,11 @@ def merge(
     parts = np.split(merged, np.cumsum([*map(len, rows)])[:-1])
     for k, (scan, given, range_m, part) in enumerate(zip(rows, poses, ranges_m, parts, strict=True)):
         pose = rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
+        if (away_m := np.abs(pose[:3, 3]).max()) >= MAX_ROUNDING_M * 2**24:
+            raise SensorError(
+                f"T_vehicle_sensor[{k}] puts the sensor at {away_m:,.0f} m, where float32 rounds points by more than "
+                f"{1e3 * MAX_ROUNDING_M:g} mm; expected its place on the vehicle: subtract the vehicle's in the map"
+            )
         fill_moved(blank_too_near(scan, range_m), np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), part)
     return merged
 

@@ -63,12 +63,17 @@ def add_axes(figure: Any, left: float, top: float, width: float, height: float) 
     return axes
 
 
+def show(axes: Any, picture: Any, **style: Any) -> None:
+    """Show an image with row 0 at the top, whatever the user's own matplotlibrc has for ``image.origin``."""
+    axes.imshow(picture, **{"origin": "upper", "aspect": "auto", **style})
+
+
 def write_text(where: Any, x: float, y: float, text: str, **style: Any) -> Any:
     """Write text in matplotlib's own font; characters that it lacks become question marks."""
     # Latin-1 is in the font. parse_math=False: "$" must not start a formula.
     text = "".join(c if c in "■…≥→↑" or (c.isprintable() and ord(c) < 256) else "?" for c in text)
     style = {"color": INK, "fontsize": 13.0, "fontfamily": "DejaVu Sans", **style}
-    return where.text(x, y, text, parse_math=False, **style)
+    return where.text(x, y, text, parse_math=False, usetex=False, **style)
 
 
 def write_at(figure: Any, x: float, y: float, text: str, **style: Any) -> float:

@@ -15,7 +15,7 @@ from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
 from ..types.sensor import SensorProfile
-from .canvas import add_axes, as_png, height_of_legend, new_figure, write_heading
+from .canvas import add_axes, as_png, height_of_legend, new_figure, show, write_heading
 from .colors import FAINT, color_of, pixel_colors, rgb
 from .content import drawable_boxes, drawable_points, perceived_image
 from .picture import Place, axes_from_above, write_frame
@@ -90,7 +90,7 @@ def draw_painted(
     colors = pixel_colors(labels.classes)
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")
     axes = add_axes(figure, _MARGIN, _TOP, width, height)
-    axes.imshow(0.5 * image / 255.0 + 0.5 * colors[labels.labels], aspect="auto", interpolation="antialiased")
+    show(axes, 0.5 * image / 255.0 + 0.5 * colors[labels.labels], interpolation="antialiased")
     _draw_points(figure, (_MARGIN, _TOP + height + _GAP, width, height), image, points, calibration, colors, painted)
     left = _MARGIN + max(width, _NARROWEST) + 34.0 + _AXIS
     room = (left, _TOP, _WIDTH - _MARGIN - left, bottom - _TOP)
@@ -109,14 +109,14 @@ def _draw_points(
     write_heading(figure, place[0], place[1] - 20, "the points in the image", more)
     axes = add_axes(figure, *place)
     gray = image.mean(axis=2, keepdims=True).repeat(3, axis=2) / 255.0
-    axes.imshow(0.35 + 0.4 * gray, aspect="auto", interpolation="antialiased")
+    show(axes, 0.35 + 0.4 * gray, interpolation="antialiased")
     axes.set_autoscale_on(False)
     u, v, depth = calibration.project(points)
     inside = (u >= 0.0) & (u < calibration.width) & (v >= 0.0) & (v < calibration.height)
     seen = painted != UNSEEN
     for shown, size, shades in ((inside & ~seen, 1.0, np.zeros_like(colors)), (inside & seen, 3.2, colors)):
         far_first = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
-        axes.scatter(u[far_first], v[far_first], s=size, c=shades[painted[far_first]], linewidths=0)
+        axes.scatter(u[far_first], v[far_first], s=size, c=shades[painted[far_first]], marker="o", linewidths=0)
 
 
 def _draw_from_above(
@@ -135,9 +135,9 @@ def _draw_from_above(
     layer = np.zeros((*road.labels.shape, 4))
     layer[road.drivable] = (*rgb([color_of("road")])[0], 0.62)
     layer[~road.observed] = (*rgb([FAINT])[0], 0.22)
-    axes.imshow(layer, extent=(y_left, y_right, x_near, x_far), aspect="auto", interpolation="nearest", zorder=1)
+    show(axes, layer, extent=(y_left, y_right, x_near, x_far), interpolation="nearest", zorder=1)
     order = np.argsort(z, kind="stable")
-    axes.scatter(y[order], x[order], s=2.0, c=colors[painted[shown[order]]], linewidths=0, zorder=2)
+    axes.scatter(y[order], x[order], s=2.0, c=colors[painted[shown[order]]], marker="o", linewidths=0, zorder=2)
     style: dict[str, Any] = {"closed": True, "fill": False, "linewidth": 2.0, "zorder": 3}
     for box in drawable_boxes(frame.move_boxes(boxes)):
         axes.add_patch(Polygon(box.corners()[:, ::-1], edgecolor=color_of(box.label), **style))

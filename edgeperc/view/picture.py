@@ -161,7 +161,9 @@ def draw_image(perception: Perception, image: Bytes, path: str | Path | None = N
     figure = canvas.new_figure(_WIDTH, legend_top + legend_height + 72)
     axes = canvas.add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
     colors = pixel_colors(labels.classes).astype(np.float32)[labels.labels]
-    axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
+    canvas.show(
+        axes, 0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased"
+    )
     size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * labels.drivable_share:.1f} % road"
     write_frame(figure, perception, (title, 1000), size, facts, (legend_top, legend_top + legend_height + 34))
     return canvas.as_png(figure, path)
@@ -225,10 +227,9 @@ def axes_from_above(figure: Any, room: Place, bounds: Place, all_around: bool) -
     ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
     step = step if left - right < 40.0 else 20.0
     beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
-    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
-    axes.set_xticks(
-        beside, labels=[f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
-    )
+    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks], usetex=False)
+    sides = [f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
+    axes.set_xticks(beside, labels=sides, usetex=False)
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.add_patch(Polygon(_SENSOR, closed=True, facecolor=INK, zorder=5))
@@ -258,13 +259,13 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         unobserved &= ~top_view.between_beams
     layer[unobserved] = (*rgb([FAINT])[0], 0.22)
     extent = (y_left, y_right, x_near, x_far)
-    axes.imshow(layer, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
+    canvas.show(axes, layer, extent=extent, interpolation="nearest", zorder=1)
     x, y, z = points[:, :3].astype(np.float64).T
     inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
     inside = inside[np.argsort(z[inside], kind="stable")]
     shade = ramp(drawn.above_m[inside], -0.2, 2.5)
     shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
-    axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, linewidths=0, zorder=2)
+    axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, marker="o", linewidths=0, zorder=2)
     outline = Rectangle(
         (y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--"
     )
@@ -342,9 +343,9 @@ def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float)
     share = np.array([0.0 if k == 0 else 0.7 if name in ("drivable", *STATIC) else 1.0 for k, name in enumerate(names)])
     share = share[painted[behind]][:, None]
     picture[hit] = (1.0 - share) * 0.72 * shade + share * drawn.colors[behind]
-    axes.imshow(picture, extent=(half, -half, 0.0, 1.0), aspect="auto", interpolation="nearest")
+    canvas.show(axes, picture, extent=(half, -half, 0.0, 1.0), interpolation="nearest")
     beside = [f"{outer}° left", f"{inner}° left", "straight ahead", f"{inner}° right", f"{outer}° right"]
-    axes.set_xticks([outer, inner, 0, -inner, -outer], labels=beside)
+    axes.set_xticks([outer, inner, 0, -inner, -outer], labels=beside, usetex=False)
 
 
 def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
@@ -368,7 +369,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
 
     if top_view is not None:
         layer, extent = _ground_layer(top_view, ground, eye, turn, wide, tall), (-wide, wide, -tall, tall)
-        axes.imshow(layer, extent=extent, aspect="auto", interpolation="bilinear", zorder=1)
+        canvas.show(axes, layer, extent=extent, interpolation="bilinear", zorder=1)
     seen = (points[:, :3].astype(np.float64) - eye) @ turn.T
     shown = (seen[:, 2] > 2.0) & (seen[:, 2] < 90.0)
     shown &= (np.abs(seen[:, 0]) < wide * seen[:, 2]) & (np.abs(seen[:, 1]) < tall * seen[:, 2])
@@ -380,9 +381,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     if "drivable" in names:
         colors[painted[order] == names.index("drivable")] *= 1.35
     size = np.clip(32.0 / depth, 1.1, 3.6) ** 1.5 * np.where(plain, 0.85, 1.5)
-    axes.scatter(
-        seen[order, 0] / depth, seen[order, 1] / depth, s=size, c=colors.clip(0.0, 1.0), linewidths=0, zorder=2
-    )
+    axes.scatter(*(seen[order, :2].T / depth), s=size, c=colors.clip(0.0, 1.0), marker="o", linewidths=0, zorder=2)
 
     labels: list[canvas.Label] = []
     if top_view is not None and road is not None:

@@ -248,7 +248,7 @@ def show_camvid(predictions: Path, path: Path, camvid: Path | None = None) -> No
     )
     axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
     for each, (name, pictures) in zip(axes, shown.items(), strict=False):
-        each.imshow(np.concatenate([*pictures]), interpolation="nearest")
+        each.imshow(np.concatenate([*pictures]), origin="upper", interpolation="nearest")
         each.set_title(name, fontsize=10)
     for each in axes:
         each.axis("off")

@@ -352,10 +352,12 @@ def test_what_does_not_fit_is_refused() -> None:
 
 def test_draw_painted(tmp_path: Path) -> None:
     pillow = pytest.importorskip("PIL.Image")
-    pytest.importorskip("matplotlib")
+    matplotlib = pytest.importorskip("matplotlib")
     scan, image = seen(0, "hdl-64e", NEAR)
     found = perceived(scan, image)
     png = draw_painted(found, image.rgb, scan.points, NEAR, tmp_path / "both.png", title="a street")
+    with matplotlib.rc_context({"image.origin": "lower", "scatter.marker": "x", "text.usetex": True}):
+        assert draw_painted(found, image.rgb, scan.points, NEAR, title="a street") == png
     assert (tmp_path / "both.png").read_bytes() == png
     with pillow.open(tmp_path / "both.png") as picture:
         assert picture.size[0] == 1600

@@ -146,6 +146,8 @@ def test_errors_name_the_reason() -> None:
         merge([], [])
     with pytest.raises(SensorError, match="1 poses for 2 scans"):
         merge([world, world], [eye])
+    with pytest.raises(SensorError, match=r"\[1\] puts the sensor at 5,000,000 m.*5 mm.*subtract"):
+        merge([world, world], [eye, eye + np.eye(4, k=2) * 5e6 * (np.arange(4) == 3)])
 
 
 def write_tum(path: Path, times: Any, poses: Any) -> Path:

@@ -236,16 +236,21 @@ def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Percep
 
 
 def test_picture_is_the_same_again_and_in_other_threads(drawn: bytes, scan: np.ndarray, perception: Perception) -> None:
-    """From named columns in any order, too. And pyplot, of which there is one a process, draws none."""
+    """From named columns in any order, too, and with a matplotlibrc of the user's. And pyplot, of which there is one a
+    process, draws none.
+    """
+    from matplotlib import rc_context
+
     before = "matplotlib.pyplot" in sys.modules
     got: list[bytes] = []
     named = np.rec.fromarrays(scan.T[::-1], names="intensity,z,y,x")
     draw = functools.partial(view.draw, perception, named, title="a scan")
     threads = [threading.Thread(target=lambda: got.append(draw())) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with rc_context({"image.origin": "lower", "scatter.marker": "x", "text.usetex": True}):
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
     assert [png == drawn for png in got] == [True, True]
     assert ("matplotlib.pyplot" in sys.modules) == before
 
