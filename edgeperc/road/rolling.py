@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from collections.abc import Collection, Iterable
@@ -168,13 +169,15 @@ class RollingGrid:
         masks = [grid.unknown, grid.obstacle, grid.drivable, grid.judged]
         kinds = np.select(masks, (_NOTHING, _OBSTACLE, _ROAD, _OFF_ROAD), _GROUND).astype(np.uint8)
         movable = self._movable(perception, points, tracks)
+        new = copy.deepcopy(self)  # an update that a signal ends changes nothing
         if step != "next":
-            self.reset()
-        self._clock, self._z_m = clock, z_m
-        n = len(self._kind)
-        self._roll(*(math.floor(along / self._cell_m) - n // 2 for along in pose[:2, 3]))
-        self._forget(self._fleeting | (self._seen_s < stamp_s - self._remember_s))
-        self._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
+            new.reset()
+        new._clock, new._z_m = clock, z_m
+        n = len(new._kind)
+        new._roll(*(math.floor(along / new._cell_m) - n // 2 for along in pose[:2, 3]))
+        new._forget(new._fleeting | (new._seen_s < stamp_s - new._remember_s))
+        new._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
+        vars(self).update(vars(new))
 
     def _movable(self, perception: Perception, points: ArrayLike, tracks: Iterable[Track]) -> Mask:
         """The scan's own cells in which something is that could move."""

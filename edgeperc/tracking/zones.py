@@ -183,25 +183,25 @@ class Line:
             raise OptionError(f"got a {type(tracks).__name__}; expected the Tracks of a scan, with its time")
         if tracks.is_late:
             return ()
-        self._now_s += elapsed_s(self._stamp_s, tracks.stamp_s)
-        self._stamp_s = tracks.stamp_s
-        found = []
+        now_s, known, found = self._now_s + elapsed_s(self._stamp_s, tracks.stamp_s), {**self.known}, []
         for track in tracks:
             place = np.array((track.world_box if self.world else track.box).center[:2])
-            last, counted, _ = self.known.get(track.id, (place, frozenset[bool](), 0.0))
+            last, counted, _ = known.get(track.id, (place, frozenset[bool](), 0.0))
             side = self._left_of(place)
             if abs(side) < self.margin_m:
                 # Near the line it keeps its last place, if it had one on a side.
-                if track.id in self.known:
-                    self.known[track.id] = last, counted, self._now_s
+                if track.id in known:
+                    known[track.id] = last, counted, now_s
                 continue
             if side * self._left_of(last) < 0.0 and (side > 0.0) not in counted and self._between(last, place):
                 counted |= {side > 0.0}
                 found.append(Crossing(track.id, track.label, side > 0.0, tracks.stamp_s))
-            self.known[track.id] = place, counted, self._now_s
-        self.known = {k: known for k, known in self.known.items() if self._now_s - known[2] <= FORGET_S}
-        self.to_left += sum(crossing.to_left for crossing in found)
-        self.to_right += sum(not crossing.to_left for crossing in found)
+            known[track.id] = place, counted, now_s
+        known = {k: each for k, each in known.items() if now_s - each[2] <= FORGET_S}
+        n_left = sum(crossing.to_left for crossing in found)
+        # Last, and without a call in between, so that a count that a signal ends can be repeated.
+        self.known, self._now_s, self._stamp_s = known, now_s, tracks.stamp_s
+        self.to_left, self.to_right = self.to_left + n_left, self.to_right + len(found) - n_left
         return tuple(found)
 
     def _left_of(self, place: Floats) -> float:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -261,7 +263,7 @@ def test_options_that_make_no_grid(options: dict[str, Any], said: str) -> None:
         RollingGrid(**options)
 
 
-def test_scans_that_cannot_be_taken_in_change_nothing() -> None:
+def test_scans_that_cannot_be_taken_in_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     grid, at = rolling(), pose()
     points = scan(at, [(6.0, 2.0)])
     grid.update(perceived(points, 1.0), points, at)
@@ -283,6 +285,16 @@ def test_scans_that_cannot_be_taken_in_change_nothing() -> None:
             grid.update(found, given_points, wrong.get("at", at))  # type: ignore[arg-type]
         np.testing.assert_array_equal(grid.values(), before)
         assert grid.stamp_s == 1.0
+    copied = copy.copy(grid)  # as for another thread
+    with monkeypatch.context() as patch:
+        patch.setattr(RollingGrid, "_observe", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            grid.update(perceived(points, 1.1), points, pose(3.0))
+    assert (grid.stamp_s, grid.origin_m) == (1.0, (-15.0, -15.0))
+    np.testing.assert_array_equal(grid.values(), before)
+    grid.update(perceived(points, 1.1), points, pose(3.0))
+    assert grid.origin_m == (-12.0, -15.0)
+    np.testing.assert_array_equal(copied.values(), before)
     for off in (-2, 101, True, 0.5):
         with pytest.raises(OptionError, match="off_road is"):
             grid.values(off)  # type: ignore[arg-type]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -111,6 +113,16 @@ def test_a_track_counts_once_for_each_direction() -> None:
     assert [crossing.to_left for crossing in crossings] == [False, True]
     assert line.count(drive(lambda t: (50.0, 0.0), n=200)[-1]) == ()
     assert len(line.known) <= 1  # the others were not seen for 10 s
+
+
+def test_a_count_that_a_signal_ends_can_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line((20, -10), (20, 10))
+    monkeypatch.setattr(Line, "_between", Mock(side_effect=[True, KeyboardInterrupt, True, True]))
+    for tracks in drive(lambda t: (15.0 + 5.0 * t, 0.0), lambda t: (15.0 + 5.0 * t, 5.0)):
+        with suppress(KeyboardInterrupt):
+            line.count(tracks)
+        line.count(tracks)
+    assert (line.to_left, line.to_right) == (0, 2)
 
 
 @pytest.mark.filterwarnings("ignore:got a scan at")
