@@ -253,13 +253,13 @@ def accumulate(
         if not isinstance(scan, tuple) or len(scan) != 3:
             raise PointsError(f"got a {type(scan).__name__}; expected each scan as edgeperc.TimedScan")
         stamp_s, points, times_s = scan
+        points = as_points(points).copy()  # a driver may fill the same array with its next scan
         if times_s is None:
             if stamp_s is None or not np.isfinite(as_seconds(stamp_s)):
                 raise StampError(
                     f"a scan has neither times of its points nor a stamp ({stamp_s}); expected one of them"
                 )
             times_s = np.full(len(points), stamp_s)
-        points = as_points(points)
         times_s = times_of(times_s, len(points))
         if np.isnan(times_s).all():
             continue
