@@ -145,7 +145,7 @@ def _draw_panel(axes: Any, scan: Mistakes) -> None:
     axes.add_patch(Polygon(sensor, closed=True, facecolor=INK))
     for kind, color, size, alpha in ((0, "#66737f", 0.7, 0.6), (2, FALSE, 7.0, 0.9), (1, MISSED, 7.0, 0.9)):
         shown = scan.points[scan.shown & (scan.wrong == kind)]
-        axes.scatter(shown[:, 1], shown[:, 0], s=size, c=color, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
+        axes.scatter(*shown[:, 1::-1].T, s=size, c=color, alpha=alpha, marker="o", linewidths=0, zorder=2 + (kind > 0))
     boxes = [(box, FOUND, "-", "") for box in scan.found]
     boxes += [(box, FALSE, "--", box.label) for box in scan.false]
     boxes += [(box, MISSED, "-", f"{box.label} · {n:,}") for box, n in scan.missed]

@@ -380,8 +380,7 @@ def merge(
     PointsError
         A scan is not points, or there is no scan.
     SensorError
-        There is not one pose for each scan, or one is not a rotation and a translation, or puts its sensor so far away,
-        as in a map, that float32 would round its points by more than 5 mm.
+        There is not one pose for each scan, or one is not rigid, or so far away, as in a map, that points are rounded.
     OptionError
         ``min_range_m`` is not one number of meters from 0, or one for each scan.
     """

@@ -173,8 +173,7 @@ class RollingGrid:
         if step != "next":
             new.reset()
         new._clock, new._z_m = clock, z_m
-        n = len(new._kind)
-        new._roll(*(math.floor(along / new._cell_m) - n // 2 for along in pose[:2, 3]))
+        new._roll(*(math.floor(along / new._cell_m) - len(new._kind) // 2 for along in pose[:2, 3]))
         new._forget(new._fleeting | (new._seen_s < stamp_s - new._remember_s))
         new._observe(kinds, movable & (kinds == _OBSTACLE), to_odom, stamp_s)
         vars(self).update(vars(new))

@@ -54,9 +54,7 @@ def add_axes(figure: Any, left: float, top: float, width: float, height: float) 
     """Add axes at a position in pixels from the upper left corner of the picture."""
     across, down = figure.bbox.width, figure.bbox.height
     axes = figure.add_axes((left / across, 1.0 - (top + height) / down, width / across, height / down))
-    axes.set_facecolor(PANEL)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(facecolor=PANEL, xticks=[], yticks=[])
     axes.tick_params(length=0, colors=FAINT, labelsize=12.5, labelfontfamily="DejaVu Sans")
     for spine in axes.spines.values():
         spine.set_color(FRAME)

@@ -204,8 +204,7 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, Floats | None]:
     if free_m <= x_near:
         return f"not free {x_near:.0f} m ahead", None
     text = f"free ahead: {'at least ' if ahead.end == 'end of view' else ''}{free_m:.0f} m"
-    half = _HALF_STRIP_M
-    neck = max(x_near, free_m - 2.0 * half)
+    half, neck = _HALF_STRIP_M, max(x_near, free_m - 2.0 * _HALF_STRIP_M)
     return text, np.array([[x_near, half], [neck, half], [free_m, 0.0], [neck, -half], [x_near, -half]])
 
 
@@ -221,8 +220,7 @@ def axes_from_above(figure: Any, room: Place, bounds: Place, all_around: bool) -
         low, high, right, left = min(low, -along), max(high, along), min(right, -across), max(left, across)
     px_per_m = min(room[3] / (high - low), room[2] / (left - right))
     axes = canvas.add_axes(figure, room[0], room[1], px_per_m * (left - right), px_per_m * (high - low))
-    axes.set_xlim(left, right)  # y grows to the left
-    axes.set_ylim(low, high)
+    axes.set(xlim=(left, right), ylim=(low, high))  # y grows to the left
     step = 10.0 if high - low > 25.0 else 5.0
     ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
     step = step if left - right < 40.0 else 20.0
@@ -258,27 +256,22 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         layer[unobserved & top_view.between_beams & top_view.road, 3] = 0.35
         unobserved &= ~top_view.between_beams
     layer[unobserved] = (*rgb([FAINT])[0], 0.22)
-    extent = (y_left, y_right, x_near, x_far)
-    canvas.show(axes, layer, extent=extent, interpolation="nearest", zorder=1)
+    canvas.show(axes, layer, extent=(y_left, y_right, x_near, x_far), interpolation="nearest", zorder=1)
     x, y, z = points[:, :3].astype(np.float64).T
     inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
     inside = inside[np.argsort(z[inside], kind="stable")]
     shade = ramp(drawn.above_m[inside], -0.2, 2.5)
     shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
     axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, marker="o", linewidths=0, zorder=2)
-    outline = Rectangle(
-        (y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--"
-    )
-    axes.add_patch(outline)
+    size = y_left - y_right, x_far - x_near
+    axes.add_patch(Rectangle((y_right, x_near), *size, fill=False, edgecolor=FAINT, linestyle="--"))
 
-    avoid = [canvas.area_of(axes, _SENSOR)]
     strip = road.free_ahead(_HALF_STRIP_M)
     text, arrow = _strip(strip, x_near)
     if arrow is not None:
         _draw_arrow(axes, arrow[:, ::-1], 4)
     labels: list[canvas.Label] = []
     beside_arrow = canvas.area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
-    avoid.append(beside_arrow)
     for box in sorted(boxes, key=lambda box: math.hypot(*box.center[:2])):
         color, footprint = color_of(box.label), box.corners()
         axes.add_patch(Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5))
@@ -296,7 +289,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     if text:
         first = 0 if arrow is None else len(labels)  # without an arrow, no other panel says it
         labels.insert(first, canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
-    n_omitted = canvas.place_labels(axes, labels, avoid)
+    n_omitted = canvas.place_labels(axes, labels, [canvas.area_of(axes, _SENSOR), beside_arrow])
     seen = f"{n_farther} farther" if n_farther else "scores"
     seen = _omitted(seen, n_omitted) if n_omitted else f"{seen}; gray: not observed"  # all is wider than the panel
     canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
@@ -357,8 +350,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
     panel = axes.get_window_extent()
     tall = 0.27
     wide = tall * panel.width / panel.height
-    axes.set_xlim(-wide, wide)
-    axes.set_ylim(-tall, tall)
+    axes.set(xlim=(-wide, wide), ylim=(-tall, tall))
 
     # Behind and above the sensor, looking at the road some 16 m ahead.
     a, b, c = ground
@@ -421,8 +413,7 @@ def _ground_layer(
     """The drivable cells on the ground as seen by the camera: RGBA, (rows, columns, 4) float64 in 0..1."""
     columns = 1200
     rows = max(1, round(columns * tall / wide))
-    u = np.linspace(-wide, wide, columns)
-    v = np.linspace(tall, -tall, rows)[:, None]
+    u, v = np.linspace(-wide, wide, columns), np.linspace(tall, -tall, rows)[:, None]
     ray = u[..., None] * turn[0] + v[..., None] * turn[1] + turn[2]
     a, b, c = ground
     # eye + k ray lies on z = a + b x + c y

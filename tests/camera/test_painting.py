@@ -359,29 +359,24 @@ def test_draw_painted(tmp_path: Path) -> None:
     with matplotlib.rc_context({"image.origin": "lower", "scatter.marker": "x", "text.usetex": True}):
         assert draw_painted(found, image.rgb, scan.points, NEAR, title="a street") == png
     assert (tmp_path / "both.png").read_bytes() == png
-    with pillow.open(tmp_path / "both.png") as picture:
-        assert picture.size[0] == 1600
-        whole = np.asarray(picture.convert("RGB")).astype(np.int16)
     # Without any class, the same picture has no color of a class beside the image itself.
     nothing = replace(found, image=ImageLabels(np.full_like(image.labels, VOID), CAMERA_CLASSES))
-    draw_painted(nothing, image.rgb, scan.points, NEAR, tmp_path / "nothing.png")
-    with pillow.open(tmp_path / "nothing.png") as picture:
-        empty = np.asarray(picture.convert("RGB")).astype(np.int16)
+    # The panel from above shows what a camera that looks back sees.
+    back = Calibration(NEAR.K, np.diag([-1.0, 1.0, -1.0, 1.0]) @ NEAR.T_camera_sensor, 640, 480)
+    cars = replace(found, image=ImageLabels(np.full_like(image.labels, CAMERA_CLASSES.index("Car")), CAMERA_CLASSES))
+    given = ((nothing, NEAR), (cars, back))
+    drawn = [png, *(draw_painted(each, image.rgb, scan.points, camera) for each, camera in given)]
+    whole, empty, looking_back = (np.asarray(pillow.open(io.BytesIO(png)).convert("RGB"), np.int16) for png in drawn)
+    assert whole.shape[1] == 1600
     car = (rgb([color_of("car")])[0] * 255.0).round()
-    dots = [int((np.abs(each - car).max(axis=2) < 12).sum()) for each in (whole, empty)]
-    assert dots[0] > 300
+    shown = (whole, empty, looking_back[120:860, 900:])
+    dots = [int((np.abs(each - car).max(axis=2) < 12).sum()) for each in shown]
+    assert min(dots[0], dots[2]) > 300
     assert dots[1] == 0
     wide = forward_camera(1240, 376)
     labels = ImageLabels(np.zeros((376, 1240), np.uint8), ("Sky",))
     few = scan.points[::50]
     draw_painted(replace(found, n_points=len(few), image=labels), np.zeros((376, 1240, 3), np.uint8), few, wide)
-    # The panel from above shows what a camera that looks back sees.
-    back = Calibration(NEAR.K, np.diag([-1.0, 1.0, -1.0, 1.0]) @ NEAR.T_camera_sensor, 640, 480)
-    cars = replace(found, image=ImageLabels(np.full_like(image.labels, CAMERA_CLASSES.index("Car")), CAMERA_CLASSES))
-    with pillow.open(io.BytesIO(draw_painted(cars, image.rgb, scan.points, back))) as picture:
-        above = np.asarray(picture.convert("RGB")).astype(np.int16)[120:860, 900:]
-    assert (np.abs(above - car).max(axis=2) < 12).sum() > 300
-
     with pytest.raises(ImageError, match="of a perception of an image of shape"):
         draw_painted(found, image.rgb[:-1], scan.points, NEAR)
     with pytest.raises(ImageError, match="of a perception of no image"):

@@ -524,12 +524,8 @@ def test_gathered_scans_have_the_points_of_that_time(
         scans.append(TimedScan(stamp_s, np.full((n, 4), k, np.float32), times if is_timed else None))
         every = np.vstack([every, np.column_stack([times, np.full(n, k)])])
     buffer = np.empty((6, 4), np.float32)  # of a driver that fills it again and again
-
-    def delivered(scan: TimedScan) -> TimedScan:
-        buffer[: len(scan.points)] = scan.points
-        return scan._replace(points=buffer[: len(scan.points)])
-
-    found = list(accumulate(map(delivered, scans), accumulate_s))
+    delivered = (scan._replace(points=np.positive(scan.points, buffer[: len(scan.points)])) for scan in scans)
+    found = list(accumulate(delivered, accumulate_s))
     assert bool(found) == bool(sum(counts[: len(stamps)]))
     for scan in found:
         expected = every[(every[:, 0] <= scan.stamp_s) & (every[:, 0] > scan.stamp_s - accumulate_s)]

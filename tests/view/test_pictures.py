@@ -1,14 +1,13 @@
 from __future__ import annotations
 
 import base64
-import functools
 import io
 import itertools
 import json
 import math
 import re
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -236,21 +235,13 @@ def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Percep
 
 
 def test_picture_is_the_same_again_and_in_other_threads(drawn: bytes, scan: np.ndarray, perception: Perception) -> None:
-    """From named columns in any order, too, and with a matplotlibrc of the user's. And pyplot, of which there is one a
-    process, draws none.
-    """
-    from matplotlib import rc_context
-
+    """From named columns in any order, and with any matplotlibrc. And pyplot, of which there is one, draws none."""
+    matplotlib = pytest.importorskip("matplotlib")
     before = "matplotlib.pyplot" in sys.modules
-    got: list[bytes] = []
     named = np.rec.fromarrays(scan.T[::-1], names="intensity,z,y,x")
-    draw = functools.partial(view.draw, perception, named, title="a scan")
-    threads = [threading.Thread(target=lambda: got.append(draw())) for _ in range(2)]
-    with rc_context({"image.origin": "lower", "scatter.marker": "x", "text.usetex": True}):
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+    theirs = {"image.origin": "lower", "scatter.marker": "x", "text.usetex": True}
+    with matplotlib.rc_context(theirs), ThreadPoolExecutor(2) as pool:
+        got = [*pool.map(lambda title: view.draw(perception, named, title=title), 2 * ["a scan"])]
     assert [png == drawn for png in got] == [True, True]
     assert ("matplotlib.pyplot" in sys.modules) == before
 
