@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shapely import Point, Polygon
 
 import twins.motion
-from edgeperc import Line, OptionError, PointsError, Tracker, Tracks, Zone
+from edgeperc import Crossing, Line, OptionError, PointsError, Tracker, Tracks, Zone
 from edgeperc.tracking.zones import mark_inside
 from scenes import box
 
@@ -112,8 +112,9 @@ def test_a_track_counts_once_for_each_direction() -> None:
 
 
 def test_a_count_that_a_signal_ends_can_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line((20, -10), (20, 10))
-    monkeypatch.setattr(Line, "_between", Mock(side_effect=[True, KeyboardInterrupt, True, True]))
+    line, one = Line((20, -10), (20, 10)), Crossing(1, "car", False, 1.0)
+    made = Mock(side_effect=[one, KeyboardInterrupt, one, one])  # two cross in the same scan
+    monkeypatch.setattr("edgeperc.tracking.zones.Crossing", made)
     for tracks in drive(lambda t: (15.0 + 5.0 * t, 0.0), lambda t: (15.0 + 5.0 * t, 5.0)):
         with suppress(KeyboardInterrupt):
             line.count(tracks)
