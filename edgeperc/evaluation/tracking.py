@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects, wrong_in_label
+from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects, label_lines, wrong_in_label
 from ..errors import TrackingError
 from ..perceiver import Perceiver
 from ..readers.files import read_points
@@ -101,7 +101,10 @@ def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
     """Files of the scans of a sequence, by frame: ``velodyne/NAME/FRAME.bin``, or those of the drive; maybe none."""
     root = Path(root)
     if (root / "label_02").is_dir():
-        return {int(path.stem): path for path in sorted((root / "velodyne" / name).glob("*.bin"))}
+        files = sorted((root / "velodyne" / name).glob("*.bin"))
+        if odd := [file for file in files if not file.stem.isdecimal()]:
+            raise TrackingError(f"{odd[0]}: expected the number of a frame as its name, such as 000012.bin; rename it")
+        return {int(path.stem): path for path in files}
     training = root / "training"
     names = [of for of, drive in KittiObjects(root).drives.items() if drive == name]
     with_ids = (of for of in names if (training / "track_id" / f"{of}.txt").exists())
@@ -110,24 +113,21 @@ def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
 
 def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], KittiCalibration]:
     """Read the labels of a sequence: their path, KITTI's 17 columns of each label as text, and the calibration."""
+    if name not in (known := sequence_names(root)):
+        raise TrackingError(f"{root} has no sequence {name!r:.60}; expected one of {', '.join(known):.80}")
     path = root / "label_02" / f"{name}.txt"
     if path.parent.is_dir():
-        try:
-            text = path.read_bytes().decode("utf-8-sig")
-        except UnicodeDecodeError as exc:
-            raise TrackingError(f"{path}: the labels cannot be read ({exc})") from exc
-        lines = [line.split() for line in text.splitlines() if line.strip()]
+        lines = [line.split() for _, line in label_lines(path)]
         return path, lines, KittiCalibration.read(root / "calib" / f"{name}.txt")
     path, lines, stem = root / "training/label_2", [], ""
     for frame, scan in sequence_scans(root, name).items():
         stem = scan.stem
-        labels = (path / f"{stem}.txt").read_text().splitlines()
-        ids = (root / "training/track_id" / f"{stem}.txt").read_text().split()
+        labels, ids = (label_lines(folder / f"{stem}.txt") for folder in (path, root / "training/track_id"))
         if len(ids) != len(labels):
             raise TrackingError(
                 f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; expected as many"
             )
-        lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
+        lines += [[str(frame), one, *label.split()] for (_, one), (_, label) in zip(ids, labels, strict=True)]
     return path, lines, KittiCalibration.read(root / "training/calib" / f"{stem}.txt")
 
 
@@ -139,7 +139,7 @@ def _values(labels: Sequence[Sequence[str]], path: Path) -> Floats:
         raise TrackingError(f"{path} is not a file of KITTI tracking labels; expected 17 columns") from exc
     for number, (columns, numbers) in enumerate(zip(labels, values.tolist(), strict=True), start=1):
         wrong = wrong_in_label(columns[2], numbers[2:])
-        if not 0.0 <= numbers[0] <= _MOST_FRAMES or not abs(numbers[1]) < 2**53:
+        if not _is_frame(numbers[0]) or not (numbers[1].is_integer() and abs(numbers[1]) < 2**53):
             wrong = f"expected the numbers of a frame and of a track, got {columns[0]}, {columns[1]}"
         if wrong:
             raise TrackingError(f"{path}, label {number}: {wrong}")
@@ -150,7 +150,8 @@ def _values(labels: Sequence[Sequence[str]], path: Path) -> Floats:
     return values
 
 
-_MOST_FRAMES = 1_000_000
+def _is_frame(number: float) -> bool:
+    return 0.0 <= number <= 1e6 and number.is_integer()
 
 
 def read_sequence(
@@ -162,7 +163,7 @@ def read_sequence(
     rules: str = RULES[0],
 ) -> TrackingSequence:
     """Read labels, calibration and detections (``detections/DETECTOR_CLASS/NAME.txt``, or ``boxes`` by frame) of a
-    sequence (`sequence_names`) of the classes of `KINDS`, by one of the `RULES`. Raises TrackingError, OSError.
+    sequence (`sequence_names`) of the classes of `KINDS`, by one of the `RULES`. Raises EdgepercError, OSError.
     """
     root = Path(root)
     label_path, labels, calibration = _labels(root, name)
@@ -205,30 +206,27 @@ def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: KittiCalibration, n_frames: int
 ) -> tuple[list[list[Box]], list[Floats]]:
     """Detections and image rectangles by frame: frame, type, rectangle, logit, h, w, l, x, y, z, turn, alpha."""
-    detections: list[list[Box]] = [[] for _ in range(n_frames)]
-    image_boxes: list[list[Floats]] = [[] for _ in range(n_frames)]
+    found = defaultdict[float, list[tuple[Box, Floats]]](list)
     for label in classes:
         folders = sorted((root / "detections").glob(f"*_{label.capitalize()}"))
         if len(folders) != 1:
             names = ", ".join(folder.name for folder in folders) or "none"
             raise TrackingError(f"{root}/detections: expected one folder *_{label.capitalize()}, got {names}")
         path = folders[0] / f"{name}.txt"
+        lines = [line.split(",") for _, line in label_lines(path)]
         try:
-            lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
             rows = np.array(lines, np.float64).reshape(-1, 15)
         except ValueError as exc:
             raise TrackingError(f"{path} is not a file of detections; expected 15 comma-separated columns") from exc
-        n_more = 1 + int(rows[:, 0].max(initial=-1.0)) - len(detections)
-        detections += [[] for _ in range(n_more)]
-        image_boxes += [[] for _ in range(n_more)]
+        if odd := [number for number in rows[:, 0].tolist() if not _is_frame(number)]:
+            raise TrackingError(f"{path}: expected the numbers of frames, from 0, in the first column, got {odd[0]:g}")
         scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
         placed = calibration.sensor_boxes(rows[:, 7:14])
-        for frame, score, seen, row in zip(
-            rows[:, 0].astype(np.int64), scores.tolist(), rows[:, 2:6], placed.tolist(), strict=True
-        ):
-            detections[frame].append(Box(label, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
-            image_boxes[frame].append(seen)
-    return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
+        for frame, score, seen, row in zip(rows[:, 0], scores.tolist(), rows[:, 2:6], placed.tolist(), strict=True):
+            found[frame].append((Box(label, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]), seen))
+    in_order = [found[k] for k in range(max(n_frames, 1 + int(max(found, default=-1))))]
+    image_boxes = [np.array([seen for _, seen in of_frame]).reshape(-1, 4) for of_frame in in_order]
+    return [[box for box, _ in of_frame] for of_frame in in_order], image_boxes
 
 
 def track_sequence(sequence: TrackingSequence, *, smooth: bool = False) -> tuple[list[Tracks], float]:

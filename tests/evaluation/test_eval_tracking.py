@@ -15,7 +15,7 @@ import pytest
 
 from checkout import printed
 from cli_helpers import Shell
-from edgeperc import TrackingError, cli
+from edgeperc import PointsError, TrackingError, cli
 from edgeperc.datasets.kitti import scan_hash
 from edgeperc.evaluation import tracking
 from edgeperc.types.sensor import get_sensor
@@ -227,9 +227,20 @@ def test_nothing_is_compiled_while_the_clock_runs(kitti: Path, what: str) -> Non
 def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
     with pytest.raises(TrackingError, match="no label_02"):
         tracking.evaluate_kitti(tmp_path / "elsewhere")
-    (kitti / "detections/pointrcnn_Car/0000.txt").write_text("0,2,100\n")
-    with pytest.raises(TrackingError, match="15 comma-separated"):
-        tracking.read_sequence(kitti, "0000")
+    with pytest.raises(TrackingError, match=r"has no sequence '\.\./0000'; expected one of 0000"):
+        tracking.read_sequence(kitti, "../0000")
+    found, cars = tracking.read_sequence(kitti, "0000").detections, kitti / "detections/pointrcnn_Car/0000.txt"
+    text = cars.read_text()
+    cars.write_text("\ufeff" + text)
+    assert tracking.read_sequence(kitti, "0000").detections == found
+    for wrong, said in (("0,2,100\n", "15 comma-separated"), ("-1" + text[text.index(",") :], "first column, got -1")):
+        cars.write_text(wrong)
+        with pytest.raises(TrackingError, match=said):
+            tracking.read_sequence(kitti, "0000")
+    (kitti / "velodyne/0000").mkdir(parents=True)
+    (kitti / "velodyne/0000/first.bin").touch()
+    with pytest.raises(TrackingError, match=r"first\.bin: expected the number of a frame"):
+        tracking.sequence_scans(kitti, "0000")
     (kitti / "detections/other_Car").mkdir()
     with pytest.raises(TrackingError, match=r"one folder \*_Car, got other_Car, pointrcnn_Car"):
         tracking.read_sequence(kitti, "0000")
@@ -251,13 +262,14 @@ LABEL = "0 1 Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
         (LABEL + "\n" + LABEL.replace("0 1", "1000000001 1", 1), "label 2: expected the numbers of a frame"),
         (LABEL.replace("0 1", "-3 1", 1), "label 1: expected the numbers of a frame"),
         (LABEL.replace("0 1", "0 nan", 1), "label 1: expected the numbers of a frame"),
+        (LABEL.replace("0 1", "0.5 1", 1), "label 1: expected the numbers of a frame"),  # it would be of none
         (LABEL.replace("1.5 1.6 3.9", "0 0 0"), "label 1: .* above 0 m"),
         (LABEL.replace("1.57", "90"), "label 1: .* in degrees"),
     ],
 )
 def test_malformed_labels_of_tracks_name_the_label(kitti: Path, text: str | bytes, error: str) -> None:
     (kitti / "label_02/0000.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(TrackingError, match=rf"0000\.txt[,:] {error}"):
+    with pytest.raises((PointsError, TrackingError), match=rf"0000\.txt[,:] {error}"):
         tracking.read_sequence(kitti, "0000")
 
 
@@ -326,6 +338,8 @@ def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_ro
     scans = tracking.sequence_scans(drive_root, "my_drive")
     assert [path.stem for path in scans.values()] == [f"{100 + k:06}" for k in range(20)]
     given = tracking.read_sequence(kitti, "0000")
+    labels = drive_root / "training/label_2/000102.txt"
+    labels.write_text("\ufeff" + labels.read_text() + "\n")  # the first one was of an unknown class
     same = tracking.read_sequence(drive_root, "my_drive", boxes=given.detections)
     for of in ("car", "pedestrian"):
         for a, b in zip(given.truth[of], same.truth[of], strict=True):
