@@ -171,10 +171,8 @@ def read_labels(path: Path) -> KittiLabels:
         except ValueError as exc:
             raise PointsError(f"{path}, line {number}: {exc}; expected a class and 14 numbers") from exc
         if len(values) < 14:
-            of_image = ", as labels of images have" if len(values) == 7 else ""
-            raise PointsError(
-                f"{path}, line {number}: expected a class and 14 finite numbers, got {len(values)}{of_image}"
-            )
+            more = ", as labels of images have" if len(values) == 7 else ""
+            raise PointsError(f"{path}, line {number}: expected a class and 14 finite numbers, got {len(values)}{more}")
         if wrong := wrong_in_label(words[0], values):
             raise PointsError(f"{path}, line {number}: {wrong}")
         rows[words[0].lower(), (*values,)] = None
@@ -184,8 +182,8 @@ def read_labels(path: Path) -> KittiLabels:
 
 def wrong_in_label(kind: str, numbers: Sequence[float]) -> str:
     """What is wrong with the 14 numbers of a label, as a sentence; empty if nothing is."""
-    if not np.isfinite(numbers).all():
-        return "expected a class and 14 finite numbers, got one that is not finite"
+    if not (np.abs(numbers) < 1e8).all():
+        return "expected a class and 14 finite numbers below 1e8, got one that is not finite, or larger"
     left, top, right, bottom = numbers[3:7]
     if 0.0 <= right < left or 0.0 <= bottom < top:  # a side beyond the image may be at the other side of its edge
         return f"expected left, top, right and bottom of a rectangle, got {left:g}, {top:g}, {right:g} and {bottom:g}"

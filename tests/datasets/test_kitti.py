@@ -355,10 +355,11 @@ CAR_LINE = "Car 0 0 0 500 150 700 300 1.5 1.6 3.9 1.0 1.7 12.0 1.57"
         (CAR_LINE.replace("12.0", "far"), r"line 1: could not convert string to float: 'far'"),
         ("\n\n" + CAR_LINE.replace("12.0", "nan"), r"line 3: .* one that is not finite"),
         (CAR_LINE.replace("12.0", "1e999"), r"line 1: .* one that is not finite"),
+        (CAR_LINE.replace("12.0", "1e300"), r"line 1: .* below 1e8"),  # numpy warned of it
         ("Car", r"line 1: .* got 0$"),
         (CAR_LINE.replace("1.5 1.6 3.9", "-1 -1 -1"), r"line 1: .* above 0 m, got -1, -1, -1; .* DontCare"),
         (CAR_LINE.replace("1.5 1.6 3.9", "0 0 0"), r"line 1: expected a height, width and length above 0 m"),
-        (CAR_LINE + "\n" + CAR_LINE.replace("3.9", "1e30"), r"line 2: .* got 1\.5, 1\.6, 1e\+30"),
+        (CAR_LINE + "\n" + CAR_LINE.replace("3.9", "1e7"), r"line 2: .* got 1\.5, 1\.6, 1e\+07"),
         (CAR_LINE.replace("1.57", "90"), r"line 1: expected a direction in radians, got 90, as if in degrees"),
         (CAR_LINE.replace("1.57", "-179.5"), r"line 1: .* as if in degrees"),
         (CAR_LINE.replace(" ", ","), r"line 1: .* got 0"),
