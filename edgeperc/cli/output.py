@@ -159,13 +159,18 @@ def lines_last(lines: Sequence[str], *, gray: bool = False) -> Iterator[None]:
 
 
 def make_places(*files: Path | None) -> None:
-    """Make the folders of files that are written at the end, and refuse what cannot be one: before the work, which may
-    take hours. Raises OptionError.
+    """Make the folders of files that are written at the end, and refuse what cannot be one, a scan that is there, or
+    a file of two options: before the work, which may take hours. Raises OptionError.
     """
-    for file in filter(None, files):
+    from ..readers.captures import SCAN_SUFFIXES
+
+    given = [file for file in files if file is not None]
+    for file in given:
         file.parent.mkdir(parents=True, exist_ok=True)
         if file.is_dir():
             raise OptionError(f"{file} is a folder; expected the name of a file, which may be in it")
+        if (file.suffix.lower() in SCAN_SUFFIXES and file.exists()) or given.count(file) > 1:
+            raise OptionError(f"{file} is a scan, or of two options, and would be overwritten; choose another name")
         if not file.exists() and not os.access(file.parent, os.W_OK):
             raise OptionError(f"{file} cannot be written: its folder is read-only; expected a file in another one")
 

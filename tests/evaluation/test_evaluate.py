@@ -860,6 +860,9 @@ def test_where_figures_cannot_be_written_is_said_before_the_work(
     monkeypatch.setattr("edgeperc.evaluation.evaluate.evaluate", Mock(side_effect=AssertionError("hours of work")))
     said = shell.err("eval", "simulation:1", "--json", tmp_path)
     assert f"{tmp_path} is a folder; expected the name of a file" in said
+    (scan := tmp_path / "scan.bin").touch()
+    for options in (("--json", scan), ("--json", tmp_path / "a", "--worst", tmp_path / "a")):
+        assert "would be overwritten" in shell.err("eval", "simulation:1", *options)
     monkeypatch.setattr("os.access", lambda *_: False)
     assert "its folder is read-only" in shell.err("eval-painting", "--json", tmp_path / "a.json")
 
