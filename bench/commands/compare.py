@@ -30,19 +30,22 @@ def add_parser(subparsers: Any) -> None:
 def run_command(arguments: argparse.Namespace) -> int:
     """Print a verdict for each setting and scenario that both reports have."""
     a, b = read_report(arguments.a), read_report(arguments.b)
+    try:
+        return _compared(a, b)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:  # of a file that was edited
+        raise ReportError(f"{arguments.a} or {arguments.b} is not as edgeperc-bench wrote it ({exc!r:.99})") from exc
+
+
+def _compared(a: dict[str, Any], b: dict[str, Any]) -> int:
     if not a["input"] or not b["input"] or a["input"]["sha256"] != b["input"]["sha256"]:
-        raise ReportError(
-            "the reports are of different scans; measure both with the same --input, --scans and --sensor"
-        )
+        raise ReportError("the reports are of different scans; measure both with one --input, --scans and --sensor")
     if a["machine"]["fingerprint"] != b["machine"]["fingerprint"]:
         print_line(f"different machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
     if a["input"]["sensor"] != b["input"]["sensor"]:
         print_line(f"different sensors: A as of {a['input']['sensor']}, B as of {b['input']['sensor']}")
     verdicts = []
     for one, other in _pairs(a["settings"], b["settings"]):
-        for name in scenario_names(one):
-            if name not in scenario_names(other):
-                continue
+        for name in (each for each in scenario_names(one) if each in scenario_names(other)):
             verdict = compare(repeats_ms(one, name), repeats_ms(other, name))
             verdicts.append(verdict.word)
             line = f"{'+'.join(one['models'])}, {name}: {setting_label(one)} -> {setting_label(other)}: {verdict.word}"

@@ -273,7 +273,7 @@ def _read(path: Path) -> dict[str, Any] | None:
             content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-        document = json.loads(content, parse_constant=_refuse, parse_float=_finite)
+        document = json.loads(content, parse_constant=_finite, parse_float=_finite)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RecursionError) as exc:
@@ -286,10 +286,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     return document
 
 
-def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is not a number of JSON")
-
-
 def _finite(text: str) -> float:
-    number = float(text)
-    return number if math.isfinite(number) else _refuse(text)
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not a number of JSON")
+    return number

@@ -133,7 +133,7 @@ def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
     written = plain(document(20.0, 20.1))
     write_report(written, tmp_path / "a.json")
     assert read_report(tmp_path / "a.json") == written
-    for k, text in enumerate(("nonsense", "[]", '{"schema": 1, "kind": "run"}')):
+    for k, text in enumerate(("nonsense", "[]", "[" * 99999, '{"schema": 1, "kind": "run"}', '{"a": NaN}')):
         (tmp_path / f"{k}.json").write_text(text)
         with pytest.raises(ReportError, match=rf"{k}\.json"):
             read_report(tmp_path / f"{k}.json")
@@ -260,6 +260,7 @@ def test_compare_answers_by_its_exit_code(reports: Any, shell: Shell) -> None:
     assert "different sensors: A as of hdl-64e, B as of os1-64" in said
     assert "B was interrupted" in said
     assert "nowhere.json" in shell.err("compare", a, "nowhere.json")
+    assert "edited.json is not as" in shell.err("compare", a, reports("edited.json", of=other | {"machine": None}))
 
 
 def test_compare_wants_the_same_setting_or_one_of_each(reports: Any, shell: Shell) -> None:
