@@ -82,7 +82,7 @@ def _local(text: str) -> Path:
     return path
 
 
-def add_sensor(group: Options, *, required: bool = False, of_capture: bool = False) -> None:
+def add_sensor(group: Options, *, of_capture: bool = False) -> None:
     """Add ``--sensor``; with ``of_capture``, it is None by default, for the sensor that a capture names."""
     default = "auto" if of_capture else DEFAULT_SENSOR
     group(
@@ -90,9 +90,8 @@ def add_sensor(group: Options, *, required: bool = False, of_capture: bool = Fal
         "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
         "nuscenes, pandaset, semantickitti, vod), a .json file written by 'edgeperc "
         "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
-        "are found in the points of the first scans" + (" (required)" if required else f" (default: {default})"),
-        required=required,
-        default=None if required or of_capture else DEFAULT_SENSOR,
+        f"are found in the points of the first scans (default: {default})",
+        default=None if of_capture else DEFAULT_SENSOR,
     )
 
 

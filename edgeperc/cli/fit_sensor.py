@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import PointsError, SensorError
 from ..system.atomic import write_atomic
-from .arguments import Commands, add_command, add_ego_box, add_sensor, options
+from .arguments import Commands, add_command, add_ego_box, options
 from .output import print_rows
 from .scans import check_profile_place, find_scans, with_mounting
 
@@ -32,7 +32,8 @@ def add_parser(commands: Commands) -> None:
     )
     reading = options(parser, "input")
     reading("scans SCAN...", "scan files, captures, or folders of them, as for 'run'", type=Path)
-    add_sensor(reading, required=True)
+    recorded = "the LiDAR that recorded the scans, as for 'run', but not auto: 'edgeperc info' names it (required)"
+    reading("--sensor SENSOR", recorded, required=True)
     add_ego_box(reading)
     reading(
         "--to SENSOR",

@@ -103,7 +103,7 @@ def fit_functions(
     x, y = x[good][order], y[good][order]
     if len(x) < 4 or np.ptp(x) == 0.0:
         raise SensorError(
-            f"{len(x)} finite pairs of {len(np.unique(x))} raw values; expected 4 or more pairs whose raw values differ"
+            f"{len(x)} finite pairs of {len(np.unique(x))} raw values; expected scans with remission, for 4 that differ"
         )
     fold = np.arange(len(x)) % FOLDS
     found = []

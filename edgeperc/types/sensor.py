@@ -556,7 +556,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
         return SENSORS[sensor] if sensor in SENSORS else PUBLIC_SENSORS[sensor]
     except (KeyError, TypeError):
         raise SensorError(
-            "sensor 'auto' is found in the first scan by a Perceiver, and nothing is found here: pass Perceiver.sensor"
+            "sensor 'auto' is found by a Perceiver, and not here: pass Perceiver.sensor, or what 'edgeperc info' names"
             if sensor == AUTO_SENSOR
             else f"no sensor {sensor!r} is built in{nearest(str(sensor), (*SENSORS, *PUBLIC_SENSORS))}; "
             f"known are {', '.join(SENSORS)}, "
