@@ -24,7 +24,7 @@ _KNOWN: dict[bytes | tuple[bytes, ...], str] = {
     b"\x1a\x45\xdf\xa3": _FILM,
     b"RIFF": "a film or an image (RIFF); edgeperc reads .jpg and .png, for a camera model",
     (b"\x89PNG", b"\xff\xd8\xff"): "an image; pass it with a camera model: --model camseg",
-    (b"II*\0", b"MM\0*"): "a TIFF image; convert it to .png, for a camera model",
+    (b"II*\0", b"MM\0*", b"GIF8"): "a TIFF or GIF image; convert it to .png, for a camera model",
     b"%PDF": "a PDF document",
     b"\x7fELF": "a program",
 }

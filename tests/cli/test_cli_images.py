@@ -165,7 +165,7 @@ def test_wrong_usage(tmp_path: Path, model: Path, shell: Shell) -> None:
         ((image, "--model", "pointseg", "--model", model), "images alone need a camera model alone"),
         ((scan, "--model", model), "scans without images need no camera model"),
         ((film, "--model", model), "a.mp4: this is a film"),
-        ((tiff, "--model", model), "a.tif: this is a TIFF image"),
+        ((tiff, "--model", model), "a.tif: this is a TIFF or GIF image"),
         ((las, "--model", model), "a.las: this is a LAS or LAZ file"),
     ):
         assert said in shell.err("run", *arguments, *CPU)
