@@ -113,7 +113,7 @@ def init_context(context: Any) -> None:
     text = os.environ.get(OPTIONS_VARIABLE, "{}")
     try:
         options = json.loads(text)
-    except ValueError as exc:
+    except (RecursionError, ValueError) as exc:
         raise OptionError(f"{OPTIONS_VARIABLE} is {text!r}, no JSON ({exc}); expected options of a Perceiver") from exc
     if not isinstance(options, dict):
         raise OptionError(f"{OPTIONS_VARIABLE} is {text!r}; expected a JSON object with options of a Perceiver")

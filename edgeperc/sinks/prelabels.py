@@ -289,7 +289,7 @@ def _known_classes(path: Path) -> dict[str, dict[str, Any]]:
         document = json.loads(path.read_text("utf-8-sig"))
         form = document["format"]
         classes = {each["name"]: {**each, "id": int(each["id"])} for each in document["classes"]}
-    except (KeyError, TypeError, ValueError) as exc:
+    except (KeyError, OverflowError, RecursionError, TypeError, ValueError) as exc:
         raise OptionError(f"{path} holds no classes of labelCloud ({exc!r:.99}); choose another folder") from exc
     if form != _FORM:
         raise OptionError(f"{path} has format {form!r:.40}, and {_FORM} would be written; choose another folder")
