@@ -162,7 +162,7 @@ def _kitti_matrices(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
         for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
             for line in file.read_text("utf-8-sig").splitlines():
                 key, _, numbers = line.replace(":", " ", 1).partition(" ")
-                if numbers.strip() and key not in _NO_NUMBERS:
+                if numbers.strip() and key != "calib_time":
                     values[key] = np.array([float(v) for v in numbers.split()])
                     if not np.isfinite(values[key]).all():
                         raise ValueError(f"{key} has a value that is not finite")
@@ -199,7 +199,6 @@ def _kitti_matrices(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
 
 
 _RAW_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")  # of a day's drives
-_NO_NUMBERS = ("calib_time",)
 
 
 def _check_matrix(name: str, K: Floats) -> None:
