@@ -35,7 +35,7 @@ def write_report(document: Mapping[str, Any], path: Path) -> None:
 def read_report(path: Path) -> dict[str, Any]:
     """Read what `write_report` wrote; raises ReportError."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=int)  # no NaN: an error of int
+        document = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=int)  # "NaN" is no int: ValueError
     except (OSError, RecursionError, ValueError) as exc:
         raise ReportError(f"{path} cannot be read as a report: {exc}") from exc
     if not isinstance(document, dict) or document.get("schema") != SCHEMA or document.get("kind") not in KINDS:
