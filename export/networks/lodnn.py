@@ -17,13 +17,11 @@ What the papers leave open, and the choices made here:
 
 from __future__ import annotations
 
-import math
-
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .pointseg import conv_bn_relu, initialize
-from .ssadnet import CONTEXT_DILATIONS, ELU_GAIN, ContextModule, conv_bn_elu, conv_elu, max_pool_with_mask, max_unpool
+from .ssadnet import CONTEXT_DILATIONS, ContextModule, conv_bn_elu, conv_elu, init_elu, max_pool_with_mask, max_unpool
 
 EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
 """Dilations (width, height) at a quarter of the resolution. Their receptive field, 65 x 127 cells of 0.4 m, covers
@@ -54,7 +52,7 @@ class LoDNN(nn.Module):
         self.context = ContextModule(32, context_width, dropout, batch_norm)
         self.decoder = conv(32, 32)
         self.classifier = nn.Conv2d(32, n_classes, 3, padding=1)
-        self._initialize(dropout)
+        init_elu(self, self.context, self.classifier, dropout)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.encoder(x)  # (B, 32, 400, 200)
@@ -62,18 +60,6 @@ class LoDNN(nn.Module):
         x = self.context(x)  # (B, 32, 200, 100)
         x = max_unpool(x, mask)  # (B, 32, 400, 200)
         return self.classifier(self.decoder(x))  # (B, 2, 400, 200)
-
-    def _initialize(self, dropout: float) -> None:
-        """As in SSADNet: preserve the variance of the signal through ELU and spatial dropout."""
-        dilated = set(self.context.dilated)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                fan_in = module.in_channels * module.kernel_size[0] * module.kernel_size[1]
-                gain = ELU_GAIN * (1.0 - dropout if module in dilated else 1.0)
-                nn.init.normal_(module.weight, std=math.sqrt(gain / fan_in))
-                if module.bias is not None:
-                    nn.init.zeros_(module.bias)
-        nn.init.normal_(self.classifier.weight, std=0.01)
 
 
 class LoDNNEdge(nn.Module):

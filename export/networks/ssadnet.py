@@ -105,6 +105,21 @@ class ContextModule(nn.Module):
         return self.project(self.dilated(x))
 
 
+def init_elu(network: nn.Module, context: ContextModule, classifier: nn.Conv2d, dropout: float) -> None:
+    """Preserve the variance through ELU and dropout, so that nine layers without batch norm can be trained."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            fan_in = module.in_channels * module.kernel_size[0] * module.kernel_size[1]
+            nn.init.normal_(module.weight, std=math.sqrt(ELU_GAIN / fan_in))
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    for module in context.dilated:
+        if isinstance(module, nn.Conv2d):
+            # Spatial dropout scales the kept channels, and so raises the variance, by 1 / (1 - p).
+            module.weight.data.mul_(math.sqrt(1.0 - dropout))
+    nn.init.normal_(classifier.weight, std=0.01)
+
+
 class SegmentationBranch(nn.Module):
     """Encoder, context module, decoder and pixel classifier (Figure 5)."""
 
@@ -260,7 +275,8 @@ class SSADNet(nn.Module):
             raise ValueError(
                 f'head is {head!r} with front={front}; expected "slots" or "slots-paper" without front, or "dense"'
             )
-        self._initialize(dropout)
+        init_elu(self, self.segmentation.context, self.segmentation.classifier, dropout)
+        self._initialize()
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         logits, features = self.segmentation(x)
@@ -268,19 +284,7 @@ class SSADNet(nn.Module):
         boxes = self.detection(torch.cat([x.to(features.dtype), features], dim=1))
         return logits, boxes
 
-    def _initialize(self, dropout: float) -> None:
-        """Preserve the variance through ELU and dropout, so that nine layers without batch norm can be trained."""
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                fan_in = module.in_channels * module.kernel_size[0] * module.kernel_size[1]
-                nn.init.normal_(module.weight, std=math.sqrt(ELU_GAIN / fan_in))
-                if module.bias is not None:
-                    nn.init.zeros_(module.bias)
-        for module in self.segmentation.context.dilated:
-            if isinstance(module, nn.Conv2d):
-                # Spatial dropout scales the kept channels, and so raises the variance, by 1 / (1 - p).
-                module.weight.data.mul_(math.sqrt(1.0 - dropout))
-        nn.init.normal_(self.segmentation.classifier.weight, std=0.01)
+    def _initialize(self) -> None:
         if isinstance(self.detection, DenseHead):
             nn.init.normal_(self.detection.predict.weight, std=0.01)
             assert self.detection.predict.bias is not None
