@@ -527,6 +527,8 @@ def _ablate(args: argparse.Namespace) -> None:
 
     if args.kitti is None or args.simulated is None:
         raise ValueError(f"{args.network} is trained on real and simulated scans; give --kitti and --simulated")
+    if args.plot is not None and args.network != "lodnn":
+        raise ValueError(f"--plot draws variants of lodnn, not of {args.network}; leave it out")
     if args.network != "lodnn" and args.start_from is None:
         raise ValueError(f"{args.network} starts from its -sim model; give --start-from")
     rows = ablate(

@@ -73,18 +73,19 @@ def ablate(
     network: str, out: Path, data: Data, run: Run, *, steps: int, variants: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Run variants (by default all, and `PAPERS`), each of ``steps`` for the shipped batch size, from the network's
-    ``-sim`` model, and add their figures to ``out/ablation.json``; those in it are not run again. Raises ValueError.
+    ``-sim`` model, and add their figures to ``out/ablation.json``; those in it are not run again. Returns those of this
+    fold and number of steps. Raises ValueError.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
     rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
-    done = {(row["network"], row["variant"], row["fold"], row["steps"]) for row in rows}
+    of_run = {"network": network, "fold": data.fold, "steps": steps}
     shipped = replace(MODELS[SHIPPED[network]].recipe, steps=steps, distil=0.0)
     known = [*VARIANTS[network], PAPERS]
     if unknown := [variant for variant in variants if variant not in known]:
         raise ValueError(f"{network} has no variant {unknown[0]!r}; expected one of: {'; '.join(known)}")
     for variant in variants or known:
-        if (network, variant, data.fold, steps) in done:
+        if any({**of_run, "variant": variant}.items() <= row.items() for row in rows):
             continue
         changes = dict(VARIANTS[network].get(variant, {}))
         teacher = run.start_from if changes.pop("teacher", False) else None
@@ -99,38 +100,34 @@ def ablate(
         last = whole_lines(folder / "log.jsonl")[-1]
         if "validation" not in last:
             raise ValueError(f"{data.kitti} has no scan of fold {data.fold} to evaluate on; give another --fold")
-        run_of = {"network": network, "variant": variant, "fold": data.fold, "steps": steps}
-        rows.append({**run_of, "scans": recipe.steps * recipe.batch, "figures": last["validation"]})
+        rows.append({**of_run, "variant": variant, "scans": recipe.steps * recipe.batch, "figures": last["validation"]})
         write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
-    return rows
+    return [row for row in rows if of_run.items() <= row.items()]
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw the search for LoDNN's learning rate, scans and batch size, like Figure 16; ValueError without a run."""
     from matplotlib.figure import Figure
 
-    rows = [row for row in rows if row["network"] == "lodnn"]
-    if not rows:
-        raise ValueError("no run of lodnn to draw; run: edgeperc-export ablate lodnn OUT")
-    (shipped,) = [row for row in rows if row["variant"] == "as shipped"]
-    recipe = MODELS[SHIPPED["lodnn"]].recipe
-    usual = {"learning rate": recipe.learning_rate, "scans times": 1.0, "batches of": float(recipe.batch)}
-    titles = {
-        "learning rate": "learning rate",
-        "scans times": f"scans drawn, times {shipped['scans']}",
-        "batches of": f"scans in a batch, {shipped['scans']} in all",
-    }
+    if not any(row["variant"] == "as shipped" for row in rows):
+        raise ValueError("no run of lodnn as shipped to draw; run: edgeperc-export ablate lodnn OUT")
+    shipped = next(row for row in rows if row["variant"] == "as shipped")
+    recipe, n = MODELS[SHIPPED["lodnn"]].recipe, shipped["scans"]
+    searched = (
+        ("learning rate", recipe.learning_rate, "learning rate"),
+        ("scans times", 1.0, f"scans drawn, times {n}"),
+        ("batches of", float(recipe.batch), f"scans in a batch, {n} in all"),
+    )
     figure = Figure(figsize=(10.0, 3.2), layout="constrained")
-    for axes, (prefix, title) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
+    for axes, (prefix, usual, title) in zip(figure.subplots(1, 3, sharey=True), searched, strict=True):
         found = [(float(r["variant"].rsplit(" ", 1)[1]), r) for r in rows if r["variant"].startswith(prefix)]
-        found = sorted([*found, (usual[prefix], shipped)], key=lambda each: each[0])
+        found = sorted([*found, (usual, shipped)], key=lambda each: each[0])
         values = [value for value, _ in found]
         axes.plot(values, [100.0 * row["figures"]["drivable"] for _, row in found], "o-", color="#009e73")
-        axes.plot([usual[prefix]], [100.0 * shipped["figures"]["drivable"]], "o", color="#202020", label="as shipped")
-        axes.set_xscale("log")
+        axes.plot([usual], [100.0 * shipped["figures"]["drivable"]], "o", color="#202020", label="as shipped")
+        axes.set(xscale="log", xlabel=title)
         axes.set_xticks(values, labels=[f"{value:g}" for value in values], minor=False, fontsize=8)
         axes.set_xticks([], minor=True)
-        axes.set_xlabel(title)
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("IoU of the road [%]")
     figure.axes[0].legend(frameon=False)

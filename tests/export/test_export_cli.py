@@ -71,6 +71,7 @@ def test_every_option_has_a_help_text() -> None:
         ("train pointseg out --workers -1", "-1 is too small; expected 0 or more"),
         ("agree pointseg --scans 0", "0 is too small; expected 1 or more"),
         ("simulate out -n 0", "0 is too small; expected 1 or more"),
+        ("ablate ssadnet . --kitti . --simulated . --plot a.png", "--plot draws variants of lodnn, not of ssadnet"),
         ("ablate camvid out --size 0x90", "0 is too small; expected 1 or more"),
     ],
 )
