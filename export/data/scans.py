@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,7 +87,7 @@ class LabeledScan:
     @classmethod
     def load(cls, path: Path) -> LabeledScan:
         """Read a file written by `save`."""
-        with np.load(path, allow_pickle=False) as data:
+        with opened(path) as data:
             numbers = zip(data["names"], data["boxes"].tolist(), strict=True)
             boxes = tuple(
                 Box(str(name), 1.0, (x, y, z), (length, width, height), yaw)
@@ -127,6 +129,16 @@ class LabeledScan:
         draw_footprints(truth, self.boxes, geometry, TOP_VIEW_CLASSES)
         truth[~self.labeled(geometry)] = IGNORE
         return truth
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Mapping[str, Any]]:
+    """Arrays of a file that `LabeledScan.save` wrote. Raises ValueError."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            yield data
+    except Exception as exc:  # of numpy, zipfile and zlib
+        raise ValueError(f"{path} is damaged or no simulated scan ({exc}); delete it, and simulate again") from exc
 
 
 def turned(scan: LabeledScan, angle: float) -> LabeledScan:

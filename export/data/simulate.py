@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -22,7 +21,7 @@ from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .processes import mapped
-from .scans import LabeledScan
+from .scans import LabeledScan, opened
 
 TRAINING_SENSOR = "hdl-64e"
 
@@ -69,7 +68,7 @@ def _path(out: Path, seed: int) -> Path:
 
 def _check_kept(out: Path, seeds: range, sensor: SensorProfile, place: str) -> None:
     for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
-        with np.load(path, allow_pickle=False) as data:
+        with opened(path) as data:
             profile, taken_at = (str(data[name]) if name in data else "" for name in ("sensor", "place"))
         kept = SensorProfile.from_json(profile) if profile else get_sensor(TRAINING_SENSOR)
         if kept != sensor:

@@ -58,8 +58,7 @@ def compare_objects(network: ObjectNet, session: Session, scans: Sequence[NDArra
     """Differences between torch and onnxruntime on the clusters of scans, as `to_onnx.verify` says: of classes among
     candidates with a score of 0.1 or more, of places and sizes [m].
     """
-    card = session.card
-    worst, agreement, box_deviation = 0.0, 1.0, 0.0
+    card, worst, agreement, box_deviation = session.card, 0.0, 1.0, 0.0
     for scan in scans:
         features, places, level = candidate_inputs(card, np.asarray(scan, np.float32))
         features, places, level = features[:MAX_ROWS], places[:MAX_ROWS], level[:MAX_ROWS]

@@ -310,10 +310,9 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dic
     standard deviations, the smallest share of equal labels, the largest difference of boxes [m]. Raises ParityError.
     """
     session = Session(path, "cpu")
-    card = session.card
     if isinstance(network, ObjectNet):
         return _checked_parity(path, len(scans), *compare_objects(network, session, scans))
-    worst, agreement, box_deviation = 0.0, 1.0, 0.0
+    card, worst, agreement, box_deviation = session.card, 0.0, 1.0, 0.0
     for image, returned in views(card, scans):
         with torch.no_grad():
             outputs = network.eval()(torch.from_numpy(image[None]))
@@ -347,20 +346,18 @@ def _checked_parity(path: Path, n_scans: int, worst: float, agreement: float, bo
             f"agree on {agreement:.4%} of the pixels or candidates (at least {MIN_AGREEMENT:.2%}), boxes differ by up "
             f"to {box_deviation:.3g} m (at most 0.05)"
         )
-    found = {"max_deviation": worst, "label_agreement": agreement, "box_deviation": box_deviation}
-    return {"n_scans": n_scans, **found}
+    return {"n_scans": n_scans, "max_deviation": worst, "label_agreement": agreement, "box_deviation": box_deviation}
 
 
 def _deviation(boxes: Sequence[Box], expected: Sequence[Box]) -> float:
     """The largest difference of a center or a size [m]. Boxes of almost the same score may come in another order."""
     left, worst = list(boxes), 0.0
     for other in expected:
-        differences = [
+        difference, k = min(
             (float(np.abs(np.subtract([*box.center, *box.size], [*other.center, *other.size])).max()), k)
             for k, box in enumerate(left)
             if box.label == other.label
-        ]
-        difference, k = min(differences)
+        )
         worst = max(worst, difference)
         del left[k]
     return worst

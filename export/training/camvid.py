@@ -123,8 +123,7 @@ def ablate_camvid(
         every = max(recipe.steps // N_POINTS, n_images // batch, 1)
         run = Run(n_threads=n_threads, compiled=compiled, checkpoint_every=every, save_every_s=60.0)
         checkpoint = train(recipe, folder, Data(camvid=camvid), run)
-        seconds = time.monotonic() - began
-        task = Camera.of(recipe)
+        seconds, task = time.monotonic() - began, Camera.of(recipe)
         state = read_checkpoint(checkpoint, device)
         trained = build_network(state, checkpoint).to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]  # not in its stubs
         watch = camvid_samples(task, camvid, device)[1]
@@ -166,8 +165,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     head = ["network", "parameters", *(f"{TITLES[name]} (paper)" for name in FIGURES), "95 % interval of mean IoU"]
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for row in rows:
-        *_, theirs = ELEVEN[row["name"]]
-        low, high = row["miou_interval"]
+        (*_, theirs), (low, high) = ELEVEN[row["name"]], row["miou_interval"]
         cells = [f"{row[figure]:.3f} ({value:.3f})" for figure, value in zip(FIGURES, theirs, strict=True)]
         lines.append([row["name"], f"{row['parameters'] / 1e6:.1f} M", *cells, f"{low:.3f} to {high:.3f}"])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
@@ -181,9 +179,8 @@ def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
     """Draw ``figures.png``, the networks beside the paper's (figures 7 to 11), and ``curves.png`` (12 to 19)."""
     from matplotlib.figure import Figure
 
-    names = [row["name"] for row in rows]
+    names, at = [row["name"] for row in rows], np.arange(len(rows))
     figure = Figure(figsize=(13.0, 0.34 * len(names) + 1.6), layout="constrained")
-    at = np.arange(len(names))
     for axes, key in zip(figure.subplots(1, len(FIGURES), sharey=True), FIGURES, strict=True):
         axes.barh(at, [row[key] for row in rows], 0.7, color=[_color(name) for name in names])
         theirs = [ELEVEN[name][2][FIGURES.index(key)] for name in names]

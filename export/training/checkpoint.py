@@ -15,6 +15,7 @@ from edgeperc.errors import CardError, ModelError
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
 from edgeperc.system.fields import Fields
+from edgeperc.types.card import ModelCard
 
 from ..networks import build
 from ..recipe import Recipe
@@ -59,6 +60,11 @@ def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
     return network
 
 
+def frames_of(path: Path) -> dict[str, str]:
+    """The hashes of the scans or images that a checkpoint or exported model was trained on, by name."""
+    return dict((ModelCard.read(path).training if path.suffix == ".onnx" else read_checkpoint(path)).get("frames", {}))
+
+
 def write_mean(paths: Sequence[Path], recipe: Recipe, out: Path) -> None:
     """Write a checkpoint of ``recipe`` with the mean of the averaged weights of runs, and all else of the first one."""
     state = torch.load(paths[0], weights_only=True, map_location="cpu")
@@ -90,10 +96,7 @@ def _checked(state: Mapping[str, Any]) -> dict[str, Any]:
             raise TypeError(f"{name} is {str(content)[:60]}; expected a {_TEXTS[name].__name__}")
     for name in ("n_simulated", "step"):
         _FIELDS.read(int, state[name], name)
-    for name in ("averaged", "best"):
-        weights = state[name]
-        if name == "best" and weights is None:
-            continue
+    for name, weights in (("averaged", state["averaged"]), ("best", state["best"] or {})):
         if not isinstance(weights, Mapping) or not all(
             isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items()
         ):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +15,24 @@ from edgeperc.system.extras import require
 
 class TrainingLog:
     """Writes ``log.jsonl``, ``log.csv`` (names as of TensorBoard, ``validation/car``) and, if asked, event files into a
-    run's folder, where a run that is resumed after ``step`` goes on: lines of later steps, which it makes again, or of
-    another run, are removed. Raises MissingExtraError.
+    run's folder, where a run goes on that is resumed with its checkpoint's ``curve``: lost lines come from there, and
+    lines of later steps, which it makes again, or of another run, are removed. Raises MissingExtraError.
     """
 
-    def __init__(self, folder: Path, step: int = 0, *, tensorboard: bool = False) -> None:
+    def __init__(self, folder: Path, curve: Sequence[Mapping[str, Any]] = (), *, tensorboard: bool = False) -> None:
         self._events: Any = None
+        step = curve[-1]["step"] if curve else 0
         if tensorboard:
             require("tensorboard", "tensorboard", "--tensorboard")
             writer = require("torch.utils.tensorboard", "tensorboard", "--tensorboard").SummaryWriter
             self._events = writer(str(folder), purge_step=step + 1)
         path, self._table = folder / "log.jsonl", folder / "log.csv"
-        if path.exists():
-            kept = [line for line in whole_lines(path) if line["step"] <= step]
-            write_atomic(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
-            self._table.unlink(missing_ok=True)
-            for line in kept:
-                self._add_row(flat(line))
+        written = {line["step"]: line for line in whole_lines(path)}
+        kept = [written.get(line["step"], {**line, "samples_per_s": None}) for line in curve]
+        write_atomic(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
+        self._table.unlink(missing_ok=True)
+        for line in kept:
+            self._add_row(flat(line))
         self._lines = path.open("a", encoding="utf-8")
 
     def write(self, line: Mapping[str, Any]) -> None:
@@ -64,12 +65,12 @@ class TrainingLog:
 
 
 def whole_lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of ``log.jsonl``; of the last one, a kill or a full disk may have left a part, which is none."""
+    """The lines of ``log.jsonl``, if it exists; a part, as a kill or a full disk leaves, and other damage are none."""
     lines = []
-    for text in path.read_text(encoding="utf-8").splitlines():
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(json.JSONDecodeError):
             lines.append(json.loads(text))
-    return lines
+    return [line for line in lines if isinstance(line, dict) and {"step", "loss"} <= line.keys()]
 
 
 def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -85,8 +86,7 @@ def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
     figures in percent, and what the last quarter brought. Raises ValueError.
     """
     path = run / "log.jsonl"
-    rows = whole_lines(path) if path.is_file() else []
-    if not rows:
+    if not (rows := whole_lines(path)):
         raise ValueError(f"{path} has no line; expected the folder of a training run")
     names = [name for name in rows[-1].get("validation", {}) if name != "background"]
     size = -(-len(rows) // max(1, n_lines))

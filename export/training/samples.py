@@ -103,8 +103,7 @@ class Samples:
     @torch.no_grad()
     def redraw(self, network: nn.Module, step: int) -> None:
         """Label some scans by a network, and draw those with many false objects more often (`odds`)."""
-        rng = np.random.default_rng((self.recipe.seed, step, 1))
-        device = next(network.parameters()).device
+        rng, device = np.random.default_rng((self.recipe.seed, step, 1)), next(network.parameters()).device
         objects = np.array([name not in ("background", "drivable") for name in self.task.classes])
         if not objects.any():
             objects[1:] = True  # of a network that labels nothing but road

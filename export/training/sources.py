@@ -70,6 +70,7 @@ class Source(NamedTuple):
     hashes: dict[str, str]
     n_real: int
     made_of: dict[str, str]  # digests of what a user may have changed: `LABELS`, `SENSOR`
+    watched: Mapping[str, str]  # as ``hashes``
     teacher: nn.Module | None = None
     fitness: dict[str, Any] | None = None
 
@@ -110,7 +111,8 @@ def _image_source(recipe: Recipe, data: Data, device: torch.device) -> Source:
             f"{data.camvid / 'classes.json'}, and the ids in trainannot"
         )
     _check_apart("image", hashes, watch.images.hashes)
-    return Source(samples, watch, hashes, len(hashes), {LABELS: hashlib.sha256(labels.tobytes()).hexdigest()})
+    made_of = {LABELS: hashlib.sha256(labels.tobytes()).hexdigest()}
+    return Source(samples, watch, hashes, len(hashes), made_of, watch.images.hashes)
 
 
 def _object_source(recipe: Recipe, folder: Path, data: Data, n_workers: int) -> Source:
@@ -130,13 +132,13 @@ def _object_source(recipe: Recipe, folder: Path, data: Data, n_workers: int) -> 
         watch = ObjectWatch(task, load_samples(folder, watched)) if watched[0] in hashes else None
         truth = " ".join((folder / f"{name}.sha256").read_text() for name in trained)
         batches = ObjectBatches(task, load_samples(folder, trained), trained)
-    return Source(batches, watch, seen, len(seen), {LABELS: truth})
+    return Source(batches, watch, seen, len(seen), {LABELS: truth}, hashes.get(watched[0], {}))
 
 
 def _scan_source(recipe: Recipe, data: Data, teacher: Path | None, n_workers: int, device: torch.device) -> Source:
     """Real and simulated scans, and the teacher."""
     task, objects = task_of(recipe), KittiObjects(data.kitti) if data.kitti else None
-    (real, weights, hashes), watched = data.given or _real(recipe, objects, data.scan_sets, data.fold)
+    (real, weights, hashes), watched, seen = (*data.given, {}) if data.given else _real(recipe, objects, data)
     paths = simulated_files(data.simulated) if data.simulated else []
     seen_as = [(s.sensor and s.sensor.to_json(), np.round(s.azimuths, 4).tolist(), s.boxes_known) for s in real]
     made_of = {LABELS: _digest_of_truth(real, paths), SENSOR: hashlib.sha256(repr(seen_as).encode()).hexdigest()}
@@ -148,14 +150,13 @@ def _scan_source(recipe: Recipe, data: Data, teacher: Path | None, n_workers: in
         extra = unlabeled_scans(objects, data.fold)
         real = pseudo_labeled(teaches, task, [*real, *extra])
         weights = [*weights, *(len(extra) ** -0.5 for _ in extra)]
-    exported = teaches if isinstance(teaches, OnnxTeacher) else None
-    samples = Samples(recipe, real, weights, paths, exported, n_workers)
+    samples = Samples(recipe, real, weights, paths, teaches if isinstance(teaches, OnnxTeacher) else None, n_workers)
     watch = Watch(samples, watched) if watched else None
     # Every set in its share: the scans of a set follow one another.
     few = [scan.points for scan in real[:: max(1, len(real) // FITNESS_SCANS)]]
     fitness = FitnessProfile.from_scans(few).to_dict() if few else None
     network = teaches.to(device) if isinstance(teaches, nn.Module) else None
-    return Source(samples, watch, hashes, len(real), made_of, network, fitness)
+    return Source(samples, watch, hashes, len(real), made_of, seen, network, fitness)
 
 
 def _teacher(task: Task, path: Path, *, labels_points: bool) -> nn.Module | OnnxTeacher:
@@ -170,10 +171,9 @@ def _teacher(task: Task, path: Path, *, labels_points: bool) -> nn.Module | Onnx
     return teacher
 
 
-def _real(
-    recipe: Recipe, kitti: KittiObjects | None, scan_sets: Sequence[ScanFolder], fold: int | None
-) -> tuple[Labeled, list[LabeledScan]]:
-    """The real scans to train on, and the scans to watch."""
+def _real(recipe: Recipe, kitti: KittiObjects | None, data: Data) -> tuple[Labeled, list[LabeledScan], dict[str, str]]:
+    """The real scans to train on, and the scans to watch with their hashes."""
+    fold = data.fold
     trained: list[Labeled] = []
     watched: list[Labeled] = []
     only_simulated = recipe.simulated_share == 1.0
@@ -185,7 +185,7 @@ def _real(
         if not only_simulated:
             names = kitti.names("train", fold=fold)
             trained.append(real_scans(kitti, names, drawn=recipe.drawn_roads, classes=recipe.classes))
-    for folder in scan_sets:
+    for folder in data.scan_sets:
         read = partial(read_scan_set, folder, fold=fold, classes=recipe.classes or POINT_CLASSES)
         if not only_simulated:
             check_trains(folder, "train", "validation", fold=fold)
@@ -193,7 +193,7 @@ def _real(
         watched.append(read("validation"))
     own, seen = joined(trained), joined(watched)
     _check_apart("scan", own.hashes, seen.hashes)
-    return own, seen.scans
+    return own, seen.scans, seen.hashes
 
 
 def _check_apart(what: str, trained: Mapping[str, str], watched: Mapping[str, str]) -> None:
@@ -236,8 +236,7 @@ def _digest_of_truth(real: Sequence[LabeledScan], simulated: Sequence[Path]) -> 
 
 def _few_of_each_drive(names: Sequence[str], drives: Sequence[str]) -> list[str]:
     """The names without most frames of long drives."""
-    chosen, seen = [], Counter[str]()
-    n_frames = Counter(drives)
+    chosen, seen, n_frames = [], Counter[str](), Counter(drives)
     for name, drive in zip(names, drives, strict=True):
         if n_frames[drive] <= FEW_FRAMES or seen[drive] % VALIDATION_STRIDE == 0:
             chosen.append(name)

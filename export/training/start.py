@@ -35,11 +35,9 @@ OUTPUT_LAYERS = {"classifier", "early", "predict"}
 FEWEST_SHARED = 0.3
 
 
-def start(
-    network: nn.Module, recipe: Recipe, path: Path, images: Sequence[Tensor]
-) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def start(network: nn.Module, recipe: Recipe, path: Path, images: Sequence[Tensor]) -> list[dict[str, Any]]:
     """Copy what a checkpoint or exported model (fp32) shares with the network; of a model, batch norm gets the
-    statistics of ``images``. Returns earlier recipes, and hashes of their scans. Raises ValueError, ModelError.
+    statistics of ``images``. Returns earlier recipes. Raises ValueError, ModelError.
     """
     own_card = card_of(recipe, version="0")
     if path.suffix == ".onnx":
@@ -47,14 +45,13 @@ def start(
         if card.precision != "fp32":
             raise ModelError(f"{path} is in {card.precision}, without most weights in fp32; give the model in fp32")
         given, folded = folded_weights(path), True
-        training = card.training or {}
-        before, frames = list(training.get("started_from", ())), dict(training.get("frames", {}))
-        before += [dict(training["recipe"])] if "recipe" in training else []
+        training = card.training
+        before = [*training.get("started_from", ()), *([dict(training["recipe"])] if "recipe" in training else [])]
     else:
         state = read_checkpoint(path)
         card, folded = card_of(state["recipe"], version="0"), False
         given = state["best"] or state["averaged"]
-        before, frames = [*state["before"], asdict(state["recipe"])], dict(state["frames"])
+        before = [*state["before"], asdict(state["recipe"])]
     pairs, first = _layers(network, torch.from_numpy(golden_input(0, golden_shape(own_card))))
     own = network.state_dict()
     common = {}
@@ -78,7 +75,7 @@ def start(
     if folded:
         shared = {conv: norm for conv, norm in pairs.items() if f"{conv}.weight" in common}
         _unfold(network, {norm: given.get(f"{conv}.weight_bias") for conv, norm in shared.items()}, images)
-    return before, frames
+    return before
 
 
 def folded_weights(path: Path) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -29,7 +30,7 @@ from ..data.scan_sets import joined_hashes
 from ..networks import build
 from ..recipe import Recipe
 from .bfloat16 import in_bfloat16
-from .checkpoint import read_checkpoint, write_checkpoint, write_mean
+from .checkpoint import CheckpointError, frames_of, read_checkpoint, write_checkpoint, write_mean
 from .log import TrainingLog
 from .object_batches import ObjectBatches
 from .ranks import Ranks
@@ -88,15 +89,11 @@ def train(recipe: Recipe, out: Path, data: Data, run: Run = Run()) -> Path:  # i
 def _alone_in(folder: Path, ranks: Ranks) -> Iterator[None]:
     """Keep another training out of a folder, where both would write one checkpoint and one log. Raises ValueError."""
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock", timeout=0)
     try:
-        if ranks.is_first:
-            lock.acquire()
-        yield
+        with FileLock(folder / ".lock", timeout=0) if ranks.is_first else nullcontext():
+            yield
     except Timeout:
         raise ValueError(f"another training runs in {folder}; wait for its end, or give another folder") from None
-    finally:
-        lock.release()
 
 
 @dataclass(slots=True)
@@ -137,9 +134,11 @@ class _Training:
         network, self.state = build(recipe), _State(hashes=self.source.hashes)
         if recipe.kept > 0.0 and run.start_from is None:
             raise ValueError(f"the recipe keeps weights ({recipe.kept:g}) but there are none; give --start-from")
-        if run.start_from is not None and not self.checkpoint.exists():
-            self.state.before, frames = self._start(network, run.start_from)
-            self.state.hashes = joined_hashes(frames, self.state.hashes)
+        if not self.checkpoint.exists():
+            for path in filter(None, (run.start_from, run.teacher)):
+                self.state.hashes = joined_hashes(frames_of(path), self.state.hashes)
+            if run.start_from is not None:
+                self.state.before = self._start(network, run.start_from)
         self.network: Any = network.to(ranks.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
         ranks.share(self.network)
         # The compiled network shares its weights with the original, which is averaged and saved.
@@ -150,6 +149,10 @@ class _Training:
         self.optimizer = make_optimizer(recipe, self.network)
         if self.checkpoint.exists():
             self._resume()
+        watched, known = self.source.watched, {*self.state.hashes.values()}
+        if seen := [name for name in watched if watched[name] in known]:
+            of = f"{len(seen)} of {len(watched)} validation scans or images, such as {seen[0]}, are of the training of"
+            warnings.warn(f"{of} --start-from or --teacher, so the validation figures are too good", stacklevel=2)
 
     def finish(self) -> Path:
         """Make the steps that are left; returns the checkpoint."""
@@ -157,7 +160,7 @@ class _Training:
         losses: list[float] = []
         began_s, began = time.monotonic(), state.step
         saved_s = began_s
-        kept = TrainingLog(self.out, state.step, tensorboard=run.tensorboard) if ranks.is_first else nullcontext()
+        kept = TrainingLog(self.out, state.curve, tensorboard=run.tensorboard) if ranks.is_first else nullcontext()
         progress = tqdm(
             total=recipe.steps, initial=state.step, desc=recipe.network, unit="step", disable=not ranks.is_first
         )
@@ -180,8 +183,8 @@ class _Training:
                     samples.odds = ranks.from_first(samples.odds)
                 if state.step % self.every and state.step != recipe.steps:
                     continue
-                line: dict[str, Any] = {"step": state.step, "samples": state.step * recipe.batch}
-                line["loss"] = round(float(np.mean(losses)), 5)
+                loss = round(float(np.mean(losses)), 5)
+                line = {"step": state.step, "samples": state.step * recipe.batch, "loss": loss}
                 losses.clear()
                 state.curve.append(line | self._validated())
                 if log is not None:
@@ -200,7 +203,7 @@ class _Training:
             return loaded(samples, state.step, recipe.steps, self.run.n_workers, self.ranks)
         return map(samples.batch, range(state.step, last_step(recipe, state.curve, self.epoch)))
 
-    def _start(self, network: nn.Module, path: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    def _start(self, network: nn.Module, path: Path) -> list[dict[str, Any]]:
         """`start`, with the first batches for the statistics of batch norm."""
         images = [torch.as_tensor(self.source.samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
         return start(network, self.recipe, path, images)
@@ -246,6 +249,8 @@ class _Training:
             return {}
         validated = watch.validate(self.averaged) if self.ranks.is_first else None
         figure, loss, figures = self.ranks.from_first(validated) or (0.0, 0.0, {})
+        if not math.isfinite(loss):  # the last step's weights have no other
+            raise FloatingPointError(f"the validation loss is {loss} at step {state.step}; lower --learning-rate")
         if figure > state.best_figure and self.stops:
             state.best_figure, state.best = figure, copy.deepcopy(self.averaged.state_dict())
         state.since_best = 0 if loss < state.lowest_loss else state.since_best + self.every
@@ -287,22 +292,26 @@ class _Training:
                 "folder"
             )
         self._check_data(kept)
-        self.network.load_state_dict(kept["network"])
-        self.averaged.load_state_dict(kept["averaged"])
-        self.optimizer.load_state_dict(kept["optimizer"])
-        self.source.samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
-        self.state = _State(kept["frames"], kept["before"], kept["curve"], kept["step"], kept["best"], *kept["watched"])
+        try:
+            for name in ("network", "averaged", "optimizer"):
+                getattr(self, name).load_state_dict(kept[name])
+            self.source.samples.odds = {name: odds.cpu().numpy() for name, odds in kept["odds"].items()}
+            self.state = _State(*(kept[k] for k in ("frames", "before", "curve", "step", "best")), *kept["watched"])
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as exc:
+            reason = " ".join(str(exc).split())[:300]
+            raise CheckpointError(f"{self.checkpoint} is damaged ({reason}); train again") from exc
 
     def _check_data(self, kept: Mapping[str, Any]) -> None:
         """Raise ValueError if a checkpoint's run was trained on other scans or images than this one."""
         frames, own, fold = kept["frames"], self.source.hashes, -1 if self.fold is None else self.fold
-        alike = own.items() <= frames.items() if kept["before"] else own == frames
+        joined = kept["before"] or self.made_of["--teacher"]
+        alike = own.items() <= frames.items() if joined else own == frames
         n_simulated = len(self.source.samples.simulated)
         if not alike or (kept["fold"], kept["n_simulated"]) != (fold, n_simulated):
             raise ValueError(
                 f"{self.checkpoint} is of a run on other data: {len(frames)} real scans or images (with those of the "
-                f"runs before), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got {len(own)}, "
-                f"{n_simulated}, fold {fold}. Give the same ones, or an empty folder"
+                f"runs before and the teacher), {kept['n_simulated']} simulated ones, fold {kept['fold']}; got "
+                f"{len(own)}, {n_simulated}, fold {fold}. Give the same ones, or an empty folder"
             )
         made_of = ({} if kept["before"] else {"--start-from": ""}) | json.loads(kept.get("made_of", "{}"))
         for name, digest in made_of.items():  # earlier versions did not write it

@@ -365,10 +365,12 @@ def test_a_set_that_is_kept_for_testing_is_not_left_out_of_training_in_silence(
     assert "has 1 labeled scans, and none is for train" in capsys.readouterr().err
 
 
-def test_a_training_tells_of_remissions_and_of_scans_that_it_has_twice(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:.*(no scan to train on has a label|the remission does not fit)")
+def test_a_training_tells_of_remissions_and_of_scans_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
     from edgeperc_export.recipe import Recipe
-    from edgeperc_export.training.train import Data, train
+    from edgeperc_export.training.samples import Watch
+    from edgeperc_export.training.train import Data, Run, train
 
     splits = {"train": ["3"], "validation": ["4"]}
     root, _ = street(tmp_path, drives="scan", splits=splits, sensor="hdl-64e")
@@ -382,6 +384,18 @@ def test_a_training_tells_of_remissions_and_of_scans_that_it_has_twice(tmp_path:
         pytest.raises(ValueError, match="validation scan street/4 is the training scan street/3, byte for byte"),
     ):
         train(Recipe("pointseg", edge=True), tmp_path / "run", Data(scan_sets=[ScanFolder(root)]))
+    recipe = Recipe("pointseg", edge=True, width=0.1, steps=1, batch=1, n_pasted=0.0, n_negatives=0.0)
+    (root / "velodyne/4.bin").write_bytes((root / "velodyne/3.bin").read_bytes()[:-16] + bytes(16))
+    (root / "scans.json").write_text(json.dumps(description | {"splits": {"train": ["4"]}}))
+    start = train(recipe, tmp_path / "start", Data(scan_sets=[ScanFolder(root)]))
+    (root / "scans.json").write_text(json.dumps(description | {"splits": splits}))
+    monkeypatch.setattr(Watch, "validate", lambda *_: (0.0, math.nan, {}))
+    with (
+        pytest.warns(UserWarning, match=r"1 of 1 validation scans or images, such as street/4, are of the training"),
+        pytest.raises(FloatingPointError, match="the validation loss is nan at step 1; lower --learning-rate"),
+    ):
+        train(recipe, tmp_path / "after", Data(scan_sets=[ScanFolder(root)]), Run(start))
+    assert not (tmp_path / "after/checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize("measure", [partial(evaluate, models=["pointseg"]), compare])

@@ -72,7 +72,7 @@ from edgeperc_export.release.to_onnx import (
 )
 from edgeperc_export.training import ablation
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, plot
-from edgeperc_export.training.checkpoint import read_checkpoint, write_checkpoint
+from edgeperc_export.training.checkpoint import CheckpointError, frames_of, read_checkpoint, write_checkpoint
 from edgeperc_export.training.samples import Recent, Samples, Watch, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Points, task_of
@@ -303,11 +303,15 @@ def test_another_recipe_and_other_data_do_not_resume(tmp_path: Path, simulated: 
     refused("of a run with another truth of its scans", given=alone(corrected, {"a": "1"}))
     aside = replace(scan, azimuths=(-1.0, 1.0))
     refused("of a run with another sensor or labeled sector", given=alone(aside, {"a": "1"}))
-    # Another scan of the same name: the card knows both.
+    # Another scan of the same name: the card knows both. So it does those of a teacher, whose terms are the student's.
     run("after", start_from=first, given=alone(scan, {"a": "2"}))
     frames = load(tmp_path / "after/checkpoint.pt")[2]["frames"]
     assert sorted(frames.values()) == ["1", "2"]
     refused("of a run on other data", "after", start_from=first, given=alone(scan, {"a": "3"}))
+    assert load(run("taught", recipe=replace(recipe, distil=1.0), teacher=first, given=None))[2]["frames"] == {"a": "1"}
+    torch.save({name: of for name, of in torch.load(first, weights_only=True).items() if name != "optimizer"}, first)
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt is damaged .'optimizer'.; train again"):
+        run("own")
 
 
 @pytest.mark.usefixtures("small_views")
@@ -335,9 +339,8 @@ def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Pat
     dense = untrained("ssadnet", tmp_path)
     slots = build(small("ssadnet", head="slots", seed=5))
     before = {name: value.clone() for name, value in slots.state_dict().items()}
-    recipes, frames = start(slots, small("ssadnet", head="slots", seed=5), dense, [])
-    assert recipes[-1]["head"] == "dense"
-    assert frames == {}
+    assert start(slots, small("ssadnet", head="slots", seed=5), dense, [])[-1]["head"] == "dense"
+    assert frames_of(dense) == {}
     given = weights(dense)
     for name, value in slots.state_dict().items():
         origin = given.get(name) if name.startswith("segmentation") else before[name]
@@ -369,10 +372,9 @@ def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
     task = task_of(recipe)
     samples = samples_of(recipe, simulated)
     image = torch.from_numpy(samples.batch(0)[0])
-    before, frames = start(network, recipe, path, [image])
     session = Session(path, "cpu", n_threads=1)
-    assert frames == session.card.training["frames"]
-    assert before[-1] == session.card.training["recipe"]
+    assert frames_of(path) == session.card.training["frames"]
+    assert start(network, recipe, path, [image])[-1] == session.card.training["recipe"]
     theirs, ours = (make_projector(card.view, card.input) for card in (session.card, task.card))
     points = np.ascontiguousarray(scans[0])
     session.input[:] = project(theirs, points).image
@@ -718,6 +720,7 @@ def test_each_variant_of_an_ablation_changes_its_setting(
     asked = ["nothing pasted", PAPERS]
     rows = ablate("pointseg", tmp_path / "out", **arguments, variants=asked)
     assert [row["variant"] for row in rows] == asked
+    (tmp_path / "out/ablation.json").write_text(json.dumps([*rows, rows[0] | {"fold": 2}]))
     assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
     assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
     asked = ["as shipped", "scans times 2", "batches of 2"]
@@ -726,8 +729,8 @@ def test_each_variant_of_an_ablation_changes_its_setting(
     pytest.importorskip("matplotlib")
     plot([*rows, rows[0] | {"variant": "learning rate 0.001"}], tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(ValueError, match="no run of lodnn to draw"):
-        plot([], tmp_path / "none.png")
+    with pytest.raises(ValueError, match="no run of lodnn as shipped to draw"):
+        plot(rows[1:], tmp_path / "none.png")
 
 
 @pytest.mark.usefixtures("small_views")
@@ -826,6 +829,9 @@ def test_simulated_scans_of_another_sensor_are_not_taken_for_those_asked_for(tmp
     with pytest.raises(ValueError, match=r"is a scan of a street, and would be kept; .* for a hall"):
         simulate(tmp_path, 1, where="hall")
     assert len([*tmp_path.iterdir()]) == 2
+    (tmp_path / "000000.npz").write_bytes((tmp_path / "000000.npz").read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"000000\.npz is damaged or no simulated scan"):
+        simulate(tmp_path, 1)
 
 
 def test_a_mounting_is_simulated_and_the_scan_is_in_the_frame_of_the_models(tmp_path: Path) -> None:

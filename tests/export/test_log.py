@@ -29,19 +29,20 @@ def test_names_of_nested_figures_have_slashes() -> None:
 def test_a_resumed_run_goes_on_in_its_files(tmp_path: Path) -> None:
     with TrainingLog(tmp_path) as log:
         log.write({"step": 100, "loss": 3.0})  # of an earlier run, without a checkpoint
-    for line in LINES:
-        with TrainingLog(tmp_path, line["step"] - 100) as log:
+    for k, line in enumerate(LINES):
+        with TrainingLog(tmp_path, LINES[:k]) as log:
             log.write(line)
-    with (tmp_path / "log.jsonl").open("a") as file:  # what a kill leaves behind a checkpoint of step 200
-        file.write('{"step": 300, "loss": 0.5, "validation": {}}\n{"step": 40')
-    with TrainingLog(tmp_path, 200):
+    damage = b'\xff\0{"step": 100, "lo\n[1]\n', b'\n{"step": 300, "loss": 0.5, "validation": {}}\n{"step": 40'
+    (tmp_path / "log.jsonl").write_bytes(json.dumps(LINES[1]).encode().join(damage))
+    with TrainingLog(tmp_path, LINES):
         pass
-    assert [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()] == LINES
+    kept = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert kept == [{**LINES[0], "samples_per_s": None}, LINES[1]]
     with (tmp_path / "log.csv").open(newline="") as file:
         rows = [*csv.reader(file)]
     assert rows == [
-        ["step", "loss", "validation/car", "validation/mean"],
-        ["100", "1.5", "0.25", ""],
+        ["step", "loss", "validation/car", "validation/mean", "samples_per_s"],
+        ["100", "1.5", "0.25", "", ""],
         ["200", "0.75", "0.5", "0.125"],
     ]
 
@@ -62,8 +63,8 @@ def test_the_curve_of_a_run_is_a_table(tmp_path: Path) -> None:
 
 def test_tensorboard_reads_the_same_figures(tmp_path: Path) -> None:
     reading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    for step, lines in ((0, [*LINES, {"step": 300, "loss": 9.0}]), (100, LINES[1:])):
-        with TrainingLog(tmp_path, step, tensorboard=True) as log:
+    for curve, lines in (((), [*LINES, {"step": 300, "loss": 9.0}]), (LINES[:1], LINES[1:])):
+        with TrainingLog(tmp_path, curve, tensorboard=True) as log:
             for line in lines:
                 log.write(line)
     events = reading.EventAccumulator(str(tmp_path))
