@@ -189,7 +189,7 @@ def road_ahead(
     ------
     OptionError
         The tolerance is negative or NaN, ``max_corners`` is below 4, or ``top_view`` is none, such as a whole
-        perception. Or a box is not finite, or has no length or width: it would stand nowhere.
+        perception. Or a box is none, is not finite, or has no length or width: it would stand nowhere.
 
     Examples
     --------
@@ -279,7 +279,8 @@ def _standing(top_view: TopView, boxes: Iterable[Box | Track]) -> tuple[Box, ...
     """Boxes and those of tracks in the frame of the cells. OptionError for what is no top view."""
     if not isinstance(top_view, TopView):
         raise OptionError(f"got a {type(top_view).__name__} for top_view; pass perception.require_top_view()")
-    return ModelFrame(top_view.mounting).move_boxes(each if isinstance(each, Box) else each.box for each in boxes)
+    given = [getattr(each, "box", each) for each in boxes] if isinstance(boxes, Iterable) else boxes
+    return ModelFrame(top_view.mounting).move_boxes(OPTIONS.each("boxes", given, Box))
 
 
 def _objects(top_view: TopView, standing: Sequence[Box]) -> Mask:

@@ -24,7 +24,7 @@ from ..system.kernels import njit
 from ..types.frame import ModelFrame, quaternion
 from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.perception import Perception, TopView, scan_of, sensor_behind
+from ..types.perception import Perception, TopView, check_perception, scan_of, sensor_behind
 from ..types.points import Floats, Floats32, Heights, Ints, Mask, Points, read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
@@ -259,6 +259,7 @@ def occupancy_grid(
     PosixPath('map/map.yaml')
     """
     check_height(min_height_m)
+    check_perception(perception)
     top_view = perception.top_view
     usual = TopViewGeometry() if top_view is None else top_view.geometry
     usual = ALL_AROUND if knows_road(perception.points) else usual

@@ -20,7 +20,7 @@ from ..tracking.moving import MOVABLE, as_classes, movable_points
 from ..types.frame import ModelFrame
 from ..types.geometry import footprints
 from ..types.mounting import MODEL_HEIGHT_M
-from ..types.perception import Perception
+from ..types.perception import Perception, check_perception
 from ..types.points import Bytes, Floats, Mask
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
@@ -141,6 +141,8 @@ class RollingGrid:
 
         Raises
         ------
+        OptionError
+            ``perception`` or a track is none.
         StampError
             The perception has no time.
         TrackingError
@@ -148,6 +150,8 @@ class RollingGrid:
         PointsError, SensorError
             As `edgeperc.occupancy_grid`.
         """
+        check_perception(perception)
+        tracks = OPTIONS.each("tracks", tracks, Track)
         stamp_s = perception.stamp_s
         if stamp_s is None or not abs(stamp_s) <= LATEST_S:
             raise StampError(f"the perception has the time {stamp_s}; call the perceiver with stamp_s=, in seconds")

@@ -22,7 +22,7 @@ from ..system.clock import GAP_S, LATEST_S, Clock, Step, as_seconds
 from ..system.fields import OPTIONS
 from ..types.frame import model_rotation
 from ..types.mounting import MODEL_MOUNTING, Mounting
-from ..types.perception import Box, Perception
+from ..types.perception import Box, Perception, check_perception
 from ..types.points import Floats, Ints64, Records
 from ..types.rigid import rigid
 from . import lives
@@ -161,6 +161,7 @@ class Tracker:
         TrackingError
             As in `update`.
         """
+        check_perception(perception)
         if perception.stamp_s is None:
             raise StampError("the perception has no stamp_s; call perceive(points, stamp_s=...) with the scan's time")
         return self.update(perception.boxes, perception.stamp_s, T_world_sensor, mounting=perception.mounting)

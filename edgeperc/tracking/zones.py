@@ -80,7 +80,7 @@ class Zone:
 
     def boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """The boxes whose center is inside, in their order."""
-        given = tuple(boxes)
+        given = OPTIONS.each("boxes", boxes, Box)
         return tuple(compress(given, self._hold(given)))
 
     def _hold(self, boxes: Iterable[Box]) -> list[bool]:
@@ -99,7 +99,7 @@ class Zone:
         -------
         tuple of Track
         """
-        given = tuple(tracks)
+        given = OPTIONS.each("tracks", tracks, Track)
         return tuple(compress(given, self._hold(track.world_box if world else track.box for track in given)))
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import ModelError, PointsError
+from ..errors import ModelError, OptionError, PointsError
 from ..system.fields import Fields
 from .choices import DEFAULT_SENSOR, STATIC
 from .mounting import MODEL_MOUNTING, Mounting
@@ -510,8 +510,15 @@ class Perception:
         }
 
 
+def check_perception(perception: object) -> None:
+    """OptionError for what is no perception."""
+    if not isinstance(perception, Perception):
+        raise OptionError(f"got a {type(perception).__name__} for the perception; pass what a Perceiver returned")
+
+
 def scan_of(perception: Perception, points: ArrayLike) -> Points:
     """The scan that was perceived, as points; PointsError if it is another."""
+    check_perception(perception)
     scan = as_points(points)
     if len(scan) != perception.n_points:
         what = f"{len(scan):,} points and a perception of {perception.n_points:,}"

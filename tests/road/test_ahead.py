@@ -323,3 +323,7 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
     for measure in (road_ahead, free_ahead):
         with pytest.raises(OptionError, match=r"got a NoneType for top_view; pass perception.require_top_view\(\)"):
             measure(None)
+        with pytest.raises(OptionError, match="boxes is None; expected Box objects"):
+            measure(view(blank()), None)
+        with pytest.raises(OptionError, match=r"boxes\[0\] is 3.0; expected a Box"):
+            measure(view(blank()), [3.0])

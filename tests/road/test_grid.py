@@ -174,6 +174,8 @@ def test_results_are_immutable_and_errors_name_the_reason() -> None:
         occupancy_grid(found, points).cell_m = 1.0  # type: ignore[misc]
     with pytest.raises(PointsError, match="expected the scan that was perceived"):
         occupancy_grid(found, points[1:])
+    with pytest.raises(OptionError, match="got a ndarray for the perception; pass what a Perceiver returned"):
+        occupancy_grid(points, points)  # type: ignore[arg-type]
     for options in (
         {"cell_m": 0.0},
         {"cell_m": math.nan},

@@ -278,11 +278,12 @@ def test_scans_that_cannot_be_taken_in_change_nothing(monkeypatch: pytest.Monkey
         (dict(at=upright), TrackingError, "upright"),
         (dict(at=hanging), TrackingError, "upside down"),
         (dict(points=points[1:]), PointsError, "that was perceived"),
+        (dict(tracks=[1.0]), OptionError, r"tracks\[0\] is 1\.0; expected a Track"),
     ):
         given_points = wrong.get("points", points)
         found = perceived(points, wrong.get("stamp_s", 1.1))  # type: ignore[arg-type]
         with pytest.raises(error, match=said):
-            grid.update(found, given_points, wrong.get("at", at))  # type: ignore[arg-type]
+            grid.update(found, given_points, wrong.get("at", at), tracks=wrong.get("tracks", ()))  # type: ignore[arg-type]
         np.testing.assert_array_equal(grid.values(), before)
         assert grid.stamp_s == 1.0
     copied = copy.copy(grid)  # as for another thread

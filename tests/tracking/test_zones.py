@@ -167,6 +167,10 @@ def test_errors_name_the_reason() -> None:
     for points in (np.zeros(3), np.zeros((3, 1)), [("a", "b")]):
         with pytest.raises(PointsError, match="got points"):
             zone.mark(points)
+    with pytest.raises(OptionError, match=r"boxes\[0\] is .*; expected a Box"):
+        zone.boxes([car(0, 0).to_dict()])  # type: ignore[list-item]
+    with pytest.raises(OptionError, match=r"tracks\[0\] is Box.*; expected a Track"):
+        zone.tracks([car(0, 0)])  # type: ignore[list-item]
     for ends in (((0, 0), (0, 0)), ((0, 0), (math.inf, 0)), ((0, 0, 0), (1, 0, 0))):
         with pytest.raises(OptionError, match="a line"):
             Line(*ends)
