@@ -853,5 +853,5 @@ def test_a_refused_scan_neither_settles_the_sensor_nor_unsettles_it() -> None:
 
 
 def test_auto_is_of_a_perceiver() -> None:
-    with pytest.raises(SensorError, match="found in the first scan by a Perceiver"):
+    with pytest.raises(SensorError, match="found by a Perceiver, and not here"):
         get_sensor("auto")

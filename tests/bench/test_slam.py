@@ -113,23 +113,23 @@ def drive_with_a_car(n: int = 16) -> tuple[slam.Drive, Any]:
 def test_the_rows_of_a_drive() -> None:
     drive, perceive = drive_with_a_car()
     seen = slam.look(perceive, drive)
-    assert [len(masks) for masks in seen.kept.values()] == [16, 16, 16]
+    assert [len(masks) for masks in seen.kept.values()] == [16, 16, 16, 16]
     assert not seen.kept["without moving"][-1][400:].any()
     assert seen.kept["without moving"][-1][:400].all()
     poses = np.concatenate([drive.poses, drive.poses[-2::-1]])
-    (whole, still, parked), motion = slam.compared(drive, seen, lambda scans: poses)
+    (whole, still, known, parked), motion = slam.compared(drive, seen, lambda scans: poses)
     assert motion[:4] == ["d", "truth", "0.000 m", "0.000 m"]
     assert 0.0 < float(motion[4].removesuffix(" m")) < 0.1  # the parked cars show the motion
     assert float(motion[5].removesuffix(" m")) >= float(motion[4].removesuffix(" m"))
     assert whole[:5] == ["d", "all points", "16, 12 m", "0.000 m", "0.000 m"]
-    shares = [float(row[5].removesuffix(" %")) for row in (whole, still, parked)]
+    shares = [float(row[5].removesuffix(" %")) for row in (whole, still, parked, known)]
     assert shares[0] > 2.0 * shares[1] > 0.0  # until the track is sure, the car is in the map
-    assert shares[2] == 0.0
-    assert [row[6] for row in (whole, still)] == ["0.00 %", "0.00 %"]
+    assert shares[2:] == [0.0, 0.0]  # in hindsight it is not
+    assert [row[6] for row in (whole, still, known)] == ["0.00 %"] * 3
     assert whole[7] == "-"
     assert float(still[7]) >= 0.0
     unknown = slam.Drive("r", drive.scans, None, None, drive.usable, drive.known, drive.labels)
-    (labeled, first, second, _), motion = slam.compared(unknown, seen, lambda scans: poses, second_pass=True)
+    (labeled, first, _, second, _), motion = slam.compared(unknown, seen, lambda scans: poses, second_pass=True)
     assert motion[1:4] == ["KISS-ICP", "-", "-"]
     assert [first[1], second[1]] == ["without moving", "same, second pass"]
     assert 0.0 < float(second[5].removesuffix(" %")) <= shares[1]  # known poses leave less doubt
