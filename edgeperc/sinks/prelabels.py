@@ -106,6 +106,7 @@ class PrelabelSink:
         self._calib = None if calib is None else Path(calib)
         self._files = ScanFiles()
         self._drive: list[tuple[_Item, Tracks]] = []  # of the scans whose tracks go on
+        self._errors: list[EdgepercError | OSError] = []
         self._stack = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         settings = self._folder / "labels/_classes.json"
@@ -122,7 +123,7 @@ class PrelabelSink:
 
     def write(self, scan: PerceivedScan) -> None:
         """Write the labels of one scan, or of the drive that ended before it. Raises OptionError if another scan has
-        its name, CalibrationError, OSError.
+        its name, CalibrationError, OSError; `close`, those of a drive.
         """
         image = scan.perception.image
         size = None if image is None else (image.labels.shape[1], image.labels.shape[0])
@@ -139,18 +140,14 @@ class PrelabelSink:
             self._write_drive(former)
 
     def _write_drive(self, drive: Sequence[tuple[_Item, Tracks]]) -> None:
-        """Write the labels of a drive that is over; raise the first error when all are written."""
+        """Write the labels of a drive that is over. `close` raises its errors, which are not of the scan that comes."""
         from ..tracking.smoothing import smooth_tracks  # it loads numba
 
-        errors = []
         for (item, _), tracks in zip(drive, smooth_tracks(tracks for _, tracks in drive), strict=True):
             try:
                 self._write_boxes(item, None if tracks.is_late else tracks)
             except (EdgepercError, OSError) as exc:
-                errors.append(exc)
-        if errors:
-            more = f"; and {len(errors) - 1} more" if len(errors) > 1 else ""
-            raise type(errors[0])(f"{errors[0]}{more}") from errors[0]
+                self._errors.append(exc)
 
     def _write_boxes(self, item: _Item, tracks: Sequence[Track] | None) -> None:
         boxes: list[Named] = [(box, None) for box in item.boxes]
@@ -173,6 +170,9 @@ class PrelabelSink:
             elif drive:
                 text = f"{len(drive)} scans of a drive that was stopped have no labels, which come when it is over"
                 warnings.warn(f"{self._folder}: {text}", RuntimeWarning, stacklevel=2)
+            if self._errors:
+                first, n_more = self._errors[0], len(self._errors) - 1
+                raise type(first)(f"{first}; and {n_more} more" if n_more else str(first)) from first
         finally:
             self._finish(whole)
 
