@@ -8,24 +8,24 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..errors import TrackingError
-from ..types.points import Floats, Ints64, Records
-from .lives import TRACK, mark_rivals
+from ..types.points import Ints64, Records
+from .lives import MOST_MOVED, TRACK, mark_rivals
 from .tracker import SHAPE_WALK_M, combine, mix, predict
 from .tracks import Tracks, strength_of
-from .ukf import CTRV, RANDOM_MOTION
+from .ukf import fill_crosses
 
 
 def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
     """Estimate the tracks of a whole recording anew, at each scan from all scans: from those after it, too.
 
     In hindsight a track begins with its first detection, ends with its last one, and goes on where none was between
-    them. Its places, headings and speeds are smoothed, and it has one class, one size and one front. What was never
-    reported stays out.
+    them. Its places, headings and speeds are smoothed, and it has one class, that of most scans, one size and one
+    front. What was never reported stays out.
 
     Parameters
     ----------
     recording : iterable of Tracks
-        What one `Tracker` returned, in this order.
+        What one `Tracker` returned, in this order, between two calls of `Tracker.reset`.
 
     Returns
     -------
@@ -44,7 +44,7 @@ def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
     >>> for tracks in smooth_tracks(online):                           # doctest: +SKIP
     ...     print(tracks.stamp_s, [track.box for track in tracks])
     """
-    answers = list(recording)
+    answers = list(recording) if isinstance(recording, Iterable) else [recording]
     if not all(isinstance(tracks, Tracks) and len(tracks.every) >= len(tracks) for tracks in answers):
         raise TrackingError("got no Tracks, or smoothed ones; pass what a Tracker returned for each scan, as it was")
     smoothed = list(answers)
@@ -59,16 +59,18 @@ def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
 def _smoothed(online: Sequence[Tracks], reported: Ints64) -> list[Tracks]:
     """The scans of one session with those tracks that were ``reported`` at any time."""
     names, class_table = online[-1].class_names, online[-1].class_table
-    after, after_s, found = np.zeros(0, TRACK), math.inf, []
+    after, after_s, found, seen = np.zeros(0, TRACK), math.inf, [], np.zeros(0, np.int64)
     for tracks in reversed(online):
-        if not tracks.stamp_s < after_s:
-            raise TrackingError(f"got a scan at {tracks.stamp_s} s before one at {after_s} s; expected one recording")
         rows = tracks.every[np.isin(tracks.every["id"], reported)]
         rows = rows[(rows["misses"] == 0) | np.isin(rows["id"], after["id"])]
         goes_on = np.isin(rows["id"], after["id"])
         later = after[np.isin(after["id"], rows["id"])]  # ids rise in every scan
+        is_reused = np.isin(rows["id"][~goes_on], seen).any() or (later["age_s"] <= rows["age_s"][goes_on]).any()
+        if not tracks.stamp_s < after_s or is_reused or tracks.class_names != names[: len(tracks.class_names)]:
+            times = f"got a scan at {tracks.stamp_s} s before one at {after_s} s"
+            raise TrackingError(f"{times}; expected one recording, of one Tracker and without a reset")
         rows[goes_on] = _retraced(rows[goes_on], later, class_table, after_s - tracks.stamp_s)
-        after, after_s = rows, tracks.stamp_s
+        after, after_s, seen = rows, tracks.stamp_s, np.union1d(seen, rows["id"])
         found.append(rows)
     smoothed = []
     for tracks, rows in zip(online, reversed(_of_lives(found)), strict=True):
@@ -82,13 +84,20 @@ def _smoothed(online: Sequence[Tracks], reported: Ints64) -> list[Tracks]:
 
 
 def _of_lives(found: Sequence[Records]) -> list[Records]:
-    """Each track with one size, the mean by precision, and one front, by the mean of what its scans knew."""
+    """Each track with the class of most scans, one size, the mean by precision, and one front, the mean of what its
+    scans knew.
+    """
     every = np.concatenate(found)
-    number = np.unique(every["id"], return_inverse=True)[1]
+    ids, last, number = np.unique(every["id"], return_index=True, return_inverse=True)
+    moved = every["fronts"][last, 0][number]  # after a long stand, a mean would not know where an object drives to
+    votes = np.zeros((len(ids), 1 + every["label"].max(initial=0)))
+    np.add.at(votes, (number, every["label"]), 1.0)
+    every["label"] = votes.argmax(axis=1)[number]
     precision = 1.0 / every["shape_variance"][:, 1:]
     for values, weights in ((every["shape"][:, 1:], precision), (every["fronts"], np.ones_like(precision))):
         for value, weight in zip(values.T, weights.T, strict=True):  # views
             value[:] = (np.bincount(number, weight * value) / np.bincount(number, weight))[number]
+    every["fronts"][:, 0] = np.where(np.abs(moved) < MOST_MOVED, every["fronts"][:, 0], moved)
     return np.split(every, np.cumsum([len(rows) for rows in found])[:-1])
 
 
@@ -101,8 +110,8 @@ def _retraced(tracks: Records, later: Records, class_table: Records, dt: float) 
     mixed = mix(tracks, of, dt)
     moved = predict(mixed, of, dt)
     (state, covariance), (expected, spread) = combine(*mixed), combine(*moved)
-    jacobians = _jacobians(mixed.means, dt)
-    by_mode = mixed.covariances @ jacobians.swapaxes(-1, -2)
+    by_mode = np.empty_like(mixed.covariances)
+    fill_crosses(mixed.means, mixed.covariances, dt, by_mode)
     by_mode += (mixed.means - state[:, None])[..., None] * (moved.means - expected[:, None])[..., None, :]
     cross = np.einsum("nj,njab->nab", mixed.prior, by_mode)
     gain = np.linalg.solve(spread, cross.swapaxes(-1, -2)).swapaxes(-1, -2)
@@ -113,23 +122,4 @@ def _retraced(tracks: Records, later: Records, class_table: Records, dt: float) 
     share = tracks["shape_variance"] / walked
     result["shape"] += share * (later["shape"] - tracks["shape"])
     result["shape_variance"] += share**2 * (later["shape_variance"] - walked)
-    result["label"] = later["label"]
-    return result
-
-
-def _jacobians(states: Floats, dt: float) -> Floats:
-    """Derivatives (n, 3, 5, 5) of the predicted states by ``states`` (n, 3, 5), by motion model."""
-    speed, heading, turn = np.moveaxis(states[..., 2:], -1, 0)
-    half = 0.5 * np.where(np.arange(3) == CTRV, turn, 0.0) * dt
-    chord = np.sinc(half / math.pi) * dt  # of an arc driven with 1 m/s
-    cos, sin = np.cos(heading + half), np.sin(heading + half)
-    result = np.zeros((*states.shape, 5))
-    result[..., [0, 1, 3], [0, 1, 3]] = 1.0
-    result[..., 2, 2] = 1.0
-    result[..., 0, 2], result[..., 1, 2] = chord * cos, chord * sin
-    result[..., 0, 3], result[..., 1, 3] = -speed * chord * sin, speed * chord * cos
-    result[:, RANDOM_MOTION, :3, 2:4] = 0.0
-    # An arc's chord hardly changes with the turn rate; its direction does.
-    result[:, CTRV, :2, 4] = 0.5 * dt * result[:, CTRV, :2, 3]
-    result[:, CTRV, 3, 4], result[:, CTRV, 4, 4] = dt, 1.0
     return result

@@ -31,9 +31,6 @@ def fill_predictions(
     """Predict each motion model of each track with sigma points (KUL-Seg's "prediction"): constant velocity, CTRV,
     random motion.
 
-    The sigma points are x, and x plus and minus each column of the Cholesky root of (n + kappa) P. Their weights are
-    kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
-
     noise : (n, 5) standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place
         [m/s^0.5], of the heading [rad/s^0.5], and speed of random motion [m/s].
     predicted : covariances, with additive process noise.
@@ -43,13 +40,7 @@ def fill_predictions(
     process = np.empty((5, 5))
     for i in range(states.shape[0]):
         for mode in range(3):
-            fill_cholesky(covariances[i, mode], root)
-            for k in range(11):
-                for a in range(5):
-                    points[k, a] = states[i, mode, a]
-                    if k > 0:
-                        points[k, a] += (math.sqrt(SPREAD) if k < 6 else -math.sqrt(SPREAD)) * root[a, (k - 1) % 5]
-                move(mode, points[k], dt)
+            fill_moved(mode, states[i, mode], covariances[i, mode], dt, root, points)
             mean, cov = means[i, mode], predicted[i, mode]
             mean[:] = 0.0
             for k in range(11):
@@ -64,6 +55,35 @@ def fill_predictions(
                         total += weight * (points[k, a] - mean[a]) * (points[k, b] - mean[b])
                     cov[a, b] = total
                     cov[b, a] = total
+
+
+@njit(cache=True, nogil=True)
+def fill_crosses(states: Floats, covariances: Floats, dt: float, crosses: Floats) -> None:
+    """Compute covariances (n, 3, 5, 5) of the states with their predictions, by the same sigma points: with others, a
+    track that is smoothed over a second and a turn gets a covariance that is not positive definite.
+    """
+    points, root = np.empty((11, 5)), np.empty((5, 5))
+    for i in range(states.shape[0]):
+        for mode in range(3):
+            fill_moved(mode, states[i, mode], covariances[i, mode], dt, root, points)
+            for a in range(5):
+                for b in range(5):
+                    crosses[i, mode, a, b] = 0.0
+                    for k in range(a + 1):
+                        apart = points[k + 1, b] - points[k + 6, b]
+                        crosses[i, mode, a, b] += 0.5 / math.sqrt(SPREAD) * root[a, k] * apart
+
+
+@njit(cache=True, nogil=True)
+def fill_moved(mode: int, state: Floats, covariance: Floats, dt: float, root: Floats, points: Floats) -> None:
+    """Compute the Cholesky root (5, 5) of a covariance, and the sigma points (11, 5) moved by ``dt`` [s]."""
+    fill_cholesky(covariance, root)
+    for k in range(11):
+        for a in range(5):
+            points[k, a] = state[a]
+            if k > 0:
+                points[k, a] += (math.sqrt(SPREAD) if k < 6 else -math.sqrt(SPREAD)) * root[a, (k - 1) % 5]
+        move(mode, points[k], dt)
 
 
 @njit(cache=True, nogil=True)

@@ -377,10 +377,11 @@ def retraced(track: Any, later: Any, of: Any, dt: float) -> tuple[np.ndarray, np
     state, covariance = combination(means, covariances, prior)
     ahead = [unscented_prediction(j, means[j], covariances[j], of["noise"], dt) for j in range(3)]
     expected, spread = combination(np.array([a[0] for a in ahead]), np.array([a[1] for a in ahead]), prior)
-    cross, step = np.zeros((5, 5)), 1e-6
+    cross = np.zeros((5, 5))
     for j in range(3):
-        F = [(moved(j, means[j] + off, dt) - moved(j, means[j] - off, dt)) / (2 * step) for off in step * np.eye(5)]
-        cross += prior[j] * (covariances[j] @ np.array(F) + np.outer(means[j] - state, ahead[j][0] - expected))
+        offs = np.linalg.cholesky(6.0 * covariances[j]).T
+        apart = [moved(j, means[j] + off, dt) - moved(j, means[j] - off, dt) for off in offs]
+        cross += prior[j] * (offs.T @ np.array(apart) / 12 + np.outer(means[j] - state, ahead[j][0] - expected))
     gain = cross @ np.linalg.inv(spread)
     share = track["shape_variance"][0] / (track["shape_variance"][0] + 0.25 * dt)
     z = track["shape"][0] + share * (later["shape"][0] - track["shape"][0])
