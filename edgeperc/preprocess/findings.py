@@ -414,12 +414,14 @@ def check_ground(
     above, below = support_of(points * np.array([1.0, -1.0, -1.0, 1.0], np.float32)), support_of(points)
     if above < _FEWEST_ABOVE or above <= _SAME * below:
         return ()
-    if (above <= _ABOVE * below or below >= _FLOOR) and below_of(points) < _HANGING:
+    is_over_all = below_of(points) >= _HANGING  # what is taken for the ground
+    if (above <= _ABOVE * below or below >= _FLOOR) and not is_over_all:
         return ()
+    is_no_floor = is_over_all and below >= _FEWEST_ABOVE  # seen well, so that it is no hall's, nor hidden by a roof
     scan = measure(points, (180.0, -180.0))
-    if scan is None or scan.far_m < _HALL_M or scan.most_m < _MOST_OF_HALL_M:
+    if scan is None or (not is_no_floor and (scan.far_m < _HALL_M or scan.most_m < _MOST_OF_HALL_M)):
         return ()
-    if sensor is not None:
+    if sensor is not None and not is_no_floor:
         as_is, turned = _off_beams(scan, sensor)
         if sensor.fov_up_deg + sensor.fov_down_deg > _ASYMMETRIC_DEG and turned - as_is > _ASYMMETRIC_DEG:
             return ()

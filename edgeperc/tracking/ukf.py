@@ -59,9 +59,7 @@ def fill_predictions(
 
 @njit(cache=True, nogil=True)
 def fill_crosses(states: Floats, covariances: Floats, dt: float, crosses: Floats) -> None:
-    """Compute covariances (n, 3, 5, 5) of the states with their predictions, by the same sigma points: with others, a
-    track that is smoothed over a second and a turn gets a covariance that is not positive definite.
-    """
+    """Compute covariances (n, 3, 5, 5) of states and predictions, by whose sigma points alone all stay positive."""
     points, root = np.empty((11, 5)), np.empty((5, 5))
     for i in range(states.shape[0]):
         for mode in range(3):
@@ -158,19 +156,15 @@ def fill_updates(
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))
     gain = np.empty((5, 3))
-    cross = np.empty((5, 3))
+    off = np.empty(3)
     for i in range(means.shape[0]):
         for mode in range(3):
             mean, cov = means[i, mode], predicted[i, mode]
             fill_innovation(mean[3], cov, sigmas[i], innovation)
             fill_inverse(innovation, inverse)
             for a in range(5):
-                cross[a, 0], cross[a, 1], cross[a, 2] = cov[a, 0], cov[a, 1], cov[a, 3]
                 for b in range(3):
-                    gain[a, b] = 0.0
-                for b in range(3):
-                    for c in range(3):
-                        gain[a, c] += cross[a, b] * inverse[b, c]
+                    gain[a, b] = cov[a, 0] * inverse[0, b] + cov[a, 1] * inverse[1, b] + cov[a, 3] * inverse[2, b]
             shift = np.zeros(3)
             spread = np.zeros((3, 3))
             limit = 3.0 * math.sqrt(innovation[2, 2])
@@ -178,18 +172,12 @@ def fill_updates(
                 share = beta[i, mode, j + 1]
                 if share == 0.0:
                     continue
-                d0 = detections[j, 0] - mean[0]
-                d1 = detections[j, 1] - mean[1]
-                d2 = min(max(half_turn(detections[j, 2] - mean[3]), -limit), limit)
-                shift[0] += share * d0
-                shift[1] += share * d1
-                shift[2] += share * d2
-                spread[0, 0] += share * d0 * d0
-                spread[0, 1] += share * d0 * d1
-                spread[0, 2] += share * d0 * d2
-                spread[1, 1] += share * d1 * d1
-                spread[1, 2] += share * d1 * d2
-                spread[2, 2] += share * d2 * d2
+                off[0], off[1] = detections[j, 0] - mean[0], detections[j, 1] - mean[1]
+                off[2] = min(max(half_turn(detections[j, 2] - mean[3]), -limit), limit)
+                for a in range(3):
+                    shift[a] += share * off[a]
+                    for b in range(a, 3):
+                        spread[a, b] += share * off[a] * off[b]
             detected = 1.0 - beta[i, mode, 0]
             for a in range(3):
                 for b in range(a, 3):

@@ -37,8 +37,9 @@ from edgeperc.preprocess.findings import (
 from edgeperc.preprocess.fitness import SUMS, FitnessProfile, Histograms, Rows, fill_scan_sums
 from edgeperc.preprocess.returns import returns
 from edgeperc.readers.files import read_points
+from edgeperc.simulation import random_scene
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.simulation.scene import SimulatedScan, sensor_pose, simulate
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import DroppedPoints
@@ -436,6 +437,13 @@ def test_the_ground_tells_up_from_down(sensor: str, turn: str) -> None:
         points = street(seed, sensor)
         assert not check_ground(points, near_support, share_below)
         assert any("upside down" in finding for finding in leveled(points * TURNED[turn], sensor) if finding.gross)
+
+
+@pytest.mark.parametrize("sensor", ["mid-360", "os0-32"])
+def test_a_low_sensor_that_hangs_sees_all_below_its_ground(sensor: str) -> None:
+    hanging, scene = replace(get_sensor(sensor), mounting=Mounting(height_m=0.3, roll_deg=180.0)), random_scene(5)
+    points = simulate(scene, hanging, 1, sensor_pose(scene, hanging)).points
+    assert check_ground(points, near_support, share_below, get_sensor(sensor))
 
 
 @pytest.mark.parametrize("seed", [1, 8, 10])
