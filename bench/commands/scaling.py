@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from edgeperc import ModelError
 from edgeperc.cli.output import make_places
 from edgeperc.system.atomic import write_atomic
 from edgeperc.system.extras import require
@@ -49,10 +50,8 @@ def add_parser(subparsers: Any) -> None:
 
     add_counts("--points", 100, None, POINT_COUNTS, "numbers of points in a scan")
     add_counts("--cars", 0, CAR_COUNTS[-1], CAR_COUNTS, f"numbers of cars in a scan, {CAR_COUNTS[-1]} at most")
-    add_counts(
-        "--sizes", 25, 1600, SIZES,
-        "image sizes in per cent of the model's own pixels, with random weights (needs the extra 'export')",
-    )  # fmt: skip
+    sizes = "image sizes in per cent of the model's own pixels, with random weights (needs the extra 'export')"
+    add_counts("--sizes", 25, 1600, SIZES, sizes)
     add_counts("--processes", 1, None, None, "numbers of concurrent processes")
     add("--plot FILE", "draw the curves to a .svg or .png file (needs the extra 'view')")
 
@@ -65,8 +64,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         require("matplotlib", "view", "Drawing the curves")
     make_places(arguments.plot)
-    limits = limits_of(arguments)
-    limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))
+    limits = replace(limits_of(arguments), warm_up_scans=min(arguments.warm_up, 5))
     with new_document("scaling", arguments) as (document, live, folder):
         live.note("simulating scans")
         scenarios = {}
@@ -81,8 +79,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         for kind, unit, per in (("points", "1,000 points", 1000.0), ("cars", "car", 1.0)):
             settings = [(n, setting, scenarios[of, n].name) for of, n in scenarios if of == kind]
             curves[kind] = _add_table(document, kind, settings, unit, per)
-        middle = min(scenarios, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
-        scan = scenarios[middle].scans[0]
+        scan = scenarios[min(scenarios, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))].scans[0]
         curves["pixels %"] = _growth_with_images(document, live, job, arguments, folder, scan)
         cores = document["machine"]["usable_cores"]
         for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
@@ -132,17 +129,19 @@ def _growth_with_images(
     from ..peers.networks import resized
 
     limits, settings = limits_of(arguments), []
-    for percent in arguments.sizes:
-        live.note(f"making networks for {percent} % of the pixels")
-        models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
+    live.note("making networks for more and fewer pixels")
+    try:
+        made = {n: tuple(str(resized(name, n / 100.0, folder)) for name in job.models) for n in arguments.sizes}
+    except ModelError as exc:  # a network made elsewhere
+        return _add_table(document, "pixels %", [], unit, sentences=[f"not measured: {exc}"])
+    for percent, models in made.items():
         scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
-        precision = "fp32" if job.precision == "int8" else job.precision  # their weights are new
-        own = replace(job, models=models, precision=precision, scenarios=(scenario,))
+        own = replace(job, models=models, precision=job.precision.replace("int8", "fp32"), scenarios=(scenario,))
         setting = new_setting(own, document)
         repeat(setting, own, arguments.repeats, document, live)
         settings.append((percent, setting, scenario.name))
-    said = ["new networks with random weights, stored in fp32"]
-    return _add_table(document, "pixels %", settings, unit, sentences=said)
+    said = "new networks with random weights, stored in fp32; those without an image as they are"
+    return _add_table(document, "pixels %", settings, unit, sentences=[said])
 
 
 def _plot(curves: Mapping[str, Curve], path: Path) -> None:

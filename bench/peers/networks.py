@@ -11,8 +11,9 @@ import numpy as np
 
 from edgeperc import ModelError
 from edgeperc.inference.session import golden_input
+from edgeperc.types.detector import PillarGeometry
 from edgeperc.types.points import Floats32
-from edgeperc.types.views import TopViewGeometry
+from edgeperc.types.views import ObjectGeometry, TopViewGeometry
 from edgeperc.zoo import resolve
 
 POINTPILLARS = "PointPillars 496x432"
@@ -34,13 +35,12 @@ def resized(model: str, share: float, folder: Path) -> Path:
     from edgeperc_export.recipe import Recipe
     from edgeperc_export.release.to_onnx import to_graph, write_card
 
-    variant = resolve(model)[0]
-    card = variant.card
+    card = resolve(model)[0].card
+    if isinstance(card.view, ObjectGeometry | PillarGeometry):
+        return Path(model)  # which has no image
     recipe = card.training.get("recipe")
     if not isinstance(recipe, dict):
-        raise ModelError(
-            f"the card of {variant.path} has no training recipe; without one its network cannot be rebuilt"
-        )
+        raise ModelError(f"the card of {model} has no training recipe; without one its network cannot be rebuilt")
     view: Any = card.view
     if isinstance(view, TopViewGeometry):
         near, far = view.x_range_m

@@ -25,7 +25,7 @@ import pytest
 import scenes
 from cli_helpers import Shell, parsers
 from edgeperc import Perceiver
-from edgeperc.errors import ModelFileError, PointsError, ProviderError, SensorError
+from edgeperc.errors import ModelError, ModelFileError, PointsError, ProviderError, SensorError
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc.system import machine
@@ -515,6 +515,11 @@ def test_scaling_measures_points_cars_sizes_and_processes(
     assert {job.precision for job in in_process if job.models[0] == str(tmp_path / "n")} <= {"fp32"}
     assert "ms per 1,000 points" in capsys.readouterr().out
     ET.fromstring(plot.read_text())
+    if HAS_EXPORT:
+        monkeypatch.setattr("edgeperc_bench.peers.networks.resized", Mock(side_effect=ModelError("made elsewhere")))
+        assert cli.main([*options, "--min-seconds", "0"]) == 0
+        assert "not measured: made elsewhere" in (printed := capsys.readouterr().out)
+        assert "Growth with processes" in printed
 
 
 def test_a_soak_reports_memory(in_process: list[worker.Job], tmp_path: Path, shell: Shell) -> None:

@@ -511,6 +511,7 @@ def test_the_same_network_for_half_the_image(
 ) -> None:
     need(("onnx", "onnxscript", "torch", "tqdm"))
     half = resized(name, 0.5, tmp_path)
+    assert resized("objects", 0.5, tmp_path) == Path("objects")  # which has no image
     assert cost(half).macs == pytest.approx(0.5 * cost(model_path(name)).macs, rel=0.01)
     perceive = Perceiver([half], provider="cpu", n_threads=1, on_mismatch="ignore")
     assert perceive.sessions[0].input.shape[1:] == shape
