@@ -19,6 +19,7 @@ from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
 from ..inference.decode import decode_classes
 from ..inference.object_network import BoxesFrom
+from ..inference.pillar_network import field_of
 from ..inference.projection import make_projector, project
 from ..inference.session import Session
 from ..objects.boxes import classes_of_boxes
@@ -56,8 +57,8 @@ class Perceiving:
     provider, precision : str
         As in `edgeperc.Perceiver`.
     boxes_from : {"both", "clusters", "network"}
-        As in `edgeperc.Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its
-        view; without such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
+        As in `edgeperc.Perceiver`. The figures ``"boxes"`` are of those that a top-view model or a detector on pillars
+        detects, in its view; without one, or with "clusters", of those around clusters, wherever the truth is known.
     rules : collection of str
         Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.rules.RULES` for an ablation.
     score_threshold : float or None
@@ -99,8 +100,7 @@ class Judge:
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES
         self.drive: str | None = None
-        whole = [session for session in self.perceive.sessions if session.card.view.kind not in ("objects", "pillars")]
-        networks = [Network(session) for session in whole]
+        networks = [Network(s) for s in self.perceive.sessions if s.card.view.kind not in ("objects", "pillars")]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
         if self.from_sensor is not None and (
@@ -112,15 +112,16 @@ class Judge:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
             self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centers()))
-        self.box_classes = (
-            self.from_above.card.box_classes if self.from_above and perceiving.boxes_from != "clusters" else ()
-        )
+        detector = self.from_above if perceiving.boxes_from != "clusters" else None
+        self.box_classes = detector.card.box_classes if detector is not None else ()
         self.detected_in = self.view if self.box_classes else None  # None: anywhere
         if not self.box_classes and self.from_sensor is not None and perceiving.boxes_from != "network":
             self.box_classes = classes_of_boxes(self.from_sensor.card.classes)
         of_objects = next((card for card in self.perceive.cards if card.view.kind in ("objects", "pillars")), None)
         if not self.box_classes and of_objects is not None:
             self.box_classes = of_objects.box_classes
+            if "objects" not in [card.view.kind for card in self.perceive.cards]:
+                self.detected_in = field_of(of_objects, full_turn=sensor is not None)
         drawing = replace(perceiving, boxes_from="network", rules=())
         self.draw_road = None if road_by is None else _perceiver([road_by], drawing, n_threads)
         cards = [*self.perceive.cards]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InferenceError
 from ..types.card import ModelCard
@@ -21,14 +20,13 @@ BEYOND_M = 5.0
 Values = Mapping[str, Floats32]
 
 
-def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) -> list[Box]:
+def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) -> tuple[list[Box], Ints64]:
     """Decode the boxes of a detector on pillars.
 
     outputs : by their names, with the batch's axis or without.
-    Returns: In the frame of the training points, best score first; of boxes of one class, or of one group of a center
-        head, that overlap by more than the card's ``nms_iou``, or with ``across_classes`` of any classes, only the best
-        one. ``front`` is the probability of the direction's bin; of a center head, it is 1 if sine and cosine are those
-        of an angle, and less the smaller both are: they are means of the headings that the network deems possible.
+    Returns: In the frame of the training points, `distinct_rows` alone, and the number of each one's class in the head.
+        ``front`` is the probability of the direction's bin; of a center head, it is 1 if sine and cosine are those of
+        an angle, and less the smaller both are: they are means of the headings that the network deems possible.
     Raises InferenceError.
     """
     view, head = card.view, card.head
@@ -46,35 +44,32 @@ def decode_detections(card: ModelCard, outputs: Values, score_threshold: float) 
     near = np.ones(len(rows), np.bool_)
     for axis, (low, high) in enumerate((view.x_range_m, view.y_range_m, view.z_range_m)):
         near &= (rows[:, axis] >= low - BEYOND_M) & (rows[:, axis] <= high + BEYOND_M)
-    rows, scores, fronts = rows[near], scores[near], fronts[near]
-    alike = [np.array(card.box_classes)[labels[near]]]
-    if isinstance(head, CenterHead):  # whose groups OpenPCDet and mmdet3d take as one class here
-        alike.insert(0, np.repeat(np.arange(len(head.groups)), head.groups)[labels[near]].astype(str))
-    kept = np.arange(len(rows))
-    for each in alike:
-        footprints = rows[kept][:, [0, 1, 3, 4, 6]]
-        kept = kept[best_rows(footprints, scores[kept], each[kept], card.nms_iou, across_classes=head.across_classes)]
-    names = alike[-1]
+    rows, scores, labels, fronts = rows[near], scores[near], labels[near], fronts[near]
+    kept = distinct_rows(card, rows[:, [0, 1, 3, 4, 6]], scores, labels)
     return [
-        Box(str(name), score, (x, y, z), (length, width, height), yaw, None if math.isnan(front) else front)
-        for (x, y, z, length, width, height, yaw), score, name, front in zip(
-            rows[kept].tolist(), scores[kept].tolist(), names[kept], fronts[kept].tolist(), strict=True
+        Box(card.box_classes[k], score, (x, y, z), (length, width, height), yaw, None if math.isnan(front) else front)
+        for (x, y, z, length, width, height, yaw), score, k, front in zip(
+            rows[kept].tolist(), scores[kept].tolist(), labels[kept].tolist(), fronts[kept].tolist(), strict=True
         )
-    ]
+    ], labels[kept]
 
 
-def best_rows(
-    footprints: Floats, scores: Floats, names: NDArray[np.str_], max_iou: float, *, across_classes: bool
-) -> Ints64:
-    """Rows of boxes, best first, that overlap no better one of their class, or of any, by more than ``max_iou``."""
-    if across_classes:
-        return suppress_overlaps(footprints, scores, max_iou)
-    kept = []
-    for name in np.unique(names):
-        rows = np.flatnonzero(names == name)
-        kept.append(rows[suppress_overlaps(footprints[rows], scores[rows], max_iou)])
-    every = np.sort(np.concatenate([np.empty(0, np.int64), *kept]))
-    return every[np.argsort(-scores[every], kind="stable")]
+def distinct_rows(card: ModelCard, footprints: Floats, scores: Floats, labels: Ints64) -> Ints64:
+    """Rows of boxes, best first: of those of one class, or of one group of a center head, that overlap by more than the
+    card's ``nms_iou``, or with ``across_classes`` of any classes, only the best one.
+    """
+    head = card.head
+    assert head is not None
+    kinds = np.array([card.box_classes.index(name) for name in card.box_classes])
+    alike = [np.zeros_like(kinds) if head.across_classes else kinds]
+    if isinstance(head, CenterHead):  # whose groups OpenPCDet and mmdet3d take as one class here
+        alike.insert(0, np.repeat(np.arange(len(head.groups)), head.groups))
+    kept = np.arange(len(scores))
+    for numbers in alike:
+        among = [kept[numbers[labels[kept]] == k] for k in np.unique(numbers)]
+        apart = [rows[suppress_overlaps(footprints[rows], scores[rows], card.nms_iou)] for rows in among]
+        kept = np.sort(np.concatenate(apart))
+    return kept[np.argsort(-scores[kept], kind="stable")]
 
 
 Decoded = tuple[Floats, Floats, Ints64, Floats]
@@ -97,9 +92,8 @@ def _anchor_boxes(maps: Values, view: PillarGeometry, head: AnchorHead, score_th
     yaws = np.array([yaw for each in head.anchors for yaw in each.yaws_rad])[anchor]
     whole = [*zip(view.x_range_m, view.y_range_m, strict=True)]
     bounds = [each.range_m or (*whole[0], *whole[1]) for each in turned]
-    n_rows, n_columns = raw.shape[:2]
-    x = np.array([_positions(each[::2], n_columns, head.centered) for each in bounds])[anchor, column]
-    y = np.array([_positions(each[1::2], n_rows, head.centered) for each in bounds])[anchor, row]
+    x = np.array([_positions(each[::2], raw.shape[1], head.centered) for each in bounds])[anchor, column]
+    y = np.array([_positions(each[1::2], raw.shape[0], head.centered) for each in bounds])[anchor, row]
     code = per_anchor("box_preds")[at][:, :7].astype(np.float64)
     boxes = np.empty((len(row), 7))
     diagonal = np.hypot(sizes[:, 0], sizes[:, 1])
@@ -128,8 +122,7 @@ def _center_boxes(
     first = 0
     for group, n_classes in enumerate(head.groups):
         raw = np.moveaxis(heat[first : first + n_classes], 0, -1)
-        at, labels, scores = _best(raw[:, :, None, :], head, score_threshold)
-        row, column, _ = at
+        (row, column, _), labels, scores = _best(raw[:, :, None, :], head, score_threshold)
         values = _values_at(maps, group, row, column)
         boxes = np.empty((len(row), 7))
         shrink = head.stride * view.cell_m

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..types.card import ModelCard
 from ..types.detector import PillarGeometry
 from ..types.frame import ModelFrame
 from ..types.geometry import rectangles
@@ -14,7 +15,7 @@ from ..types.mounting import Mounting
 from ..types.perception import Box
 from ..types.points import Points
 from ..types.views import TopViewGeometry
-from .detections import best_rows, decode_detections
+from .detections import decode_detections, distinct_rows
 from .pillars import Pillarizer
 from .session import Session
 
@@ -34,30 +35,36 @@ class PillarNetwork:
         quarters = 4 if full_turn and not view.is_all_around else 1
         height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
         self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
-        corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m]) @ self.frames[0].R[:2, :2].T
-        (x_low, y_low), (x_high, y_high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-        reach_m = min(x_high, -y_low, y_high)
-        if quarters > 1 and reach_m > 0.0:
-            x_low, y_low, x_high, y_high = -reach_m, -reach_m, reach_m, reach_m
-        self.field = TopViewGeometry(
-            (x_low, x_high), (y_low, y_high), cell_m=min(100.0, x_high - x_low, y_high - y_low)
-        )
-        """What it sees of the models' frame; of a full turn, the square that is seen as a whole."""
+        self.field = field_of(session.card, full_turn)
 
     def find_boxes(self, points: Points) -> Sequence[Box]:
         """Boxes in the frame of the models, best score first."""
         boxes: list[Box] = []
+        labels: list[int] = []
         for frame in self.frames:
             n = self._pillarizer.fill(frame.move_back(points))
             if n == 0:
                 continue
             for taken, array in self._beside:
                 taken[:n] = array[:n]
-            boxes += frame.move_boxes(decode_detections(self.card, self.session.run(n), self._score))
+            found, numbers = decode_detections(self.card, self.session.run(n), self._score)
+            boxes += frame.move_boxes(found)
+            labels += numbers.tolist()
         if len(self.frames) == 1:
             return boxes
-        assert self.card.head is not None
-        names, scores = np.array([box.label for box in boxes]), np.array([box.score for box in boxes])
-        across = self.card.head.across_classes
-        kept = best_rows(rectangles(boxes), scores, names, self.card.nms_iou, across_classes=across)
+        scores = np.array([box.score for box in boxes])
+        kept = distinct_rows(self.card, rectangles(boxes), scores, np.array(labels, np.int64))
         return [boxes[row] for row in kept.tolist()]
+
+
+def field_of(card: ModelCard, full_turn: bool) -> TopViewGeometry:
+    """What a detector sees of the models' frame; of a full turn, the square that is seen as a whole."""
+    view = card.view
+    assert isinstance(view, PillarGeometry)
+    turned = ModelFrame(Mounting(card.mount_height_m, 0.0, view.pitch_deg, view.yaw_deg)).R[:2, :2]
+    corners = np.array([(x, y) for x in view.x_range_m for y in view.y_range_m]) @ turned.T
+    (x_low, y_low), (x_high, y_high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+    reach_m = min(x_high, -y_low, y_high)
+    if full_turn and not view.is_all_around and reach_m > 0.0:
+        x_low, y_low, x_high, y_high = -reach_m, -reach_m, reach_m, reach_m
+    return TopViewGeometry((x_low, x_high), (y_low, y_high), cell_m=min(100.0, x_high - x_low, y_high - y_low))

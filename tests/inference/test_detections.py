@@ -24,6 +24,7 @@ import twins.decode
 from cli_helpers import Shell
 from edgeperc import Perceiver, Tracker
 from edgeperc.errors import CardMismatchError, InferenceError, ProviderError
+from edgeperc.evaluation.judge import Judge
 from edgeperc.inference.detections import decode_detections
 from edgeperc.inference.pillars import Pillarizer
 from edgeperc.inference.session import Session
@@ -227,20 +228,30 @@ def test_the_frame_of_the_training_points(
 
 
 @pytest.mark.compiled
-def test_a_full_turn_has_the_boxes_of_each_quarter(models: dict[str, Path], points: NDArray[np.float32]) -> None:
-    """Without those that overlap a better one of their class at the seams."""
+@pytest.mark.parametrize(("kind", "among"), [("anchors", [*zip(KINDS)]), ("centers", [KINDS])])
+def test_a_full_turn_has_the_boxes_of_each_quarter(
+    kind: str, among: list[tuple[str, ...]], models: dict[str, Path], points: NDArray[np.float32]
+) -> None:
+    """Without those that overlap a better one of their class, or of their group, at the seams."""
     every: list[Box] = []
     for k in range(4):
         frame = ModelFrame(replace(MODEL_MOUNTING, yaw_deg=90.0 * k))
-        every += frame.move_boxes(perceived(models["anchors"], frame.move_back(points)).boxes)
-    whole = perceived(models["anchors"], points, full_turn=True).boxes
+        every += frame.move_boxes(perceived(models[kind], frame.move_back(points)).boxes)
+    whole = perceived(models[kind], points, full_turn=True).boxes
     kept: list[Box] = []
-    for kind in KINDS:
-        alike = sorted((box for box in every if box.label == kind), key=lambda box: -box.score)
+    for names in among:
+        alike = sorted((box for box in every if box.label in names), key=lambda box: -box.score)
         rows = twins.decode.nms(rectangles(alike), MAX_IOU)
         kept += [box for box, keep in zip(alike, rows, strict=True) if keep]
     assert len(kept) > 20
     assert_near(whole, sorted(kept, key=lambda box: -box.score), 1e-3)
+
+
+def test_what_it_cannot_see_is_not_judged(models: dict[str, Path]) -> None:
+    view = Judge([models["anchors"]]).detected_in
+    assert view is not None
+    assert [view.holds(*at) for at in ((20.0, 10.0), (-5.0, 0.0), (30.0, 0.0), (20.0, 20.0))] == [True, *[False] * 3]
+    assert Judge([models["anchors"], "objects"]).detected_in is None
 
 
 def test_it_runs_beside_the_other_networks_and_is_tracked(models: dict[str, Path], points: NDArray[np.float32]) -> None:
@@ -373,7 +384,7 @@ def random_maps(seed: int) -> dict[str, NDArray[np.float32]]:
 def decoded(outputs: dict[str, tuple[str, NDArray[np.float32]]], head: CenterHead = GROUPS) -> list[Box]:
     specs = tuple(OutputSpec(name, kind) for name, (kind, _) in outputs.items())
     card = replace(card_of("centers"), outputs=specs, head=head)
-    return decode_detections(card, {name: values for name, (_, values) in outputs.items()}, 0.4)
+    return decode_detections(card, {name: values for name, (_, values) in outputs.items()}, 0.4)[0]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -462,7 +473,7 @@ def anchored(
     maps["box_preds"][[6, 13, 20], 20, 20] = yaw
     if bins:
         maps["dir_cls_preds"][:, 20, 20] = np.tile(bins, 3)
-    return decode_detections(card, maps, 0.1)
+    return decode_detections(card, maps, 0.1)[0]
 
 
 @pytest.mark.parametrize("yaw", [-1.5, -0.3, 0.0, 0.5, 1.2])
