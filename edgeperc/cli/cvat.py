@@ -100,7 +100,7 @@ def _read(request: object) -> tuple[bytes, float | None]:
     if not isinstance(image, str):
         keys = ", ".join(map(repr, request)) or "nothing"
         raise OptionError(f"the request has {keys:.80}, and image is {image!r:.40}; expected the scan in base64")
-    if threshold is not None and not (isinstance(threshold, int | float) and 0.0 <= threshold <= 1.0):
+    if threshold is not None and not (type(threshold) in (int, float) and 0.0 <= threshold <= 1.0):
         raise OptionError(f"threshold is {threshold!r:.40}; expected a number in 0..1, or none")
     try:
         return base64.b64decode(image, validate=True), threshold

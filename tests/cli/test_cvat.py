@@ -177,6 +177,7 @@ FAULTS: dict[str, tuple[object, int, str, str]] = {
     "base64 cut short": ({"image": "QUJDR"}, 400, "OptionError", "no base64"),
     "no ASCII": ({"image": "é"}, 400, "OptionError", "no base64"),
     "threshold of a text": ({"image": "", "threshold": "high"}, 400, "OptionError", "'high'.*0..1"),
+    "threshold of a flag": ({"image": "", "threshold": True}, 400, "OptionError", "True.*0..1"),
     "threshold of a list": ({"image": "", "threshold": [0.5]}, 400, "OptionError", "0..1"),
     "threshold out of range": ({"image": "", "threshold": 50}, 400, "OptionError", "50.*0..1"),
     "an empty file": ({"image": ""}, 422, "PointsError", "empty"),
