@@ -112,6 +112,8 @@ def draw(perception: Perception, points: ArrayLike, path: str | Path | None = No
         left = _MARGIN + _AXIS + _draw_top_view(figure, drawn, top_view, road) + 34.0
     width = _WIDTH - _MARGIN - left
     _draw_from_behind(figure, (left, _TOP, width, 520), drawn)
+    part = ("90° ahead" if turn_deg == 90.0 else "all around") + ", a class for every point" * (found is not None)
+    canvas.write_heading(figure, left, 680, "as the sensor sees it", part)
     _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), drawn, turn_deg)
 
     count = f"{perception.n_points:,} points"
@@ -303,9 +305,7 @@ def _omitted(text: str, n_omitted: int) -> str:
 def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float) -> None:
     """Draw a part of the turn as a range image. It is only a picture, not the projection of a network."""
     axes = canvas.add_axes(figure, *place)
-    part, columns, outer, inner = ("90° ahead", 512, 40, 20) if turn_deg == 90.0 else ("all around", 1024, 150, 75)
-    more = f"{part}, a class for every point"
-    canvas.write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", more)
+    columns, outer, inner = (512, 40, 20) if turn_deg == 90.0 else (1024, 150, 75)
     names, painted = drawn.names, drawn.painted
     x, y, z = drawn.points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -206,7 +207,8 @@ def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perceptio
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
+def test_picture_of_one_view(scan: np.ndarray, perception: Perception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edgeperc.view.canvas.write_heading", headings := Mock())
     points_alone = pixels(view.draw(replace(perception, top_view=None, boxes=()), scan))
     assert near(points_alone, "pedestrian").sum() > 100
     assert not near(points_alone, "drivable").any()
@@ -214,6 +216,8 @@ def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
     assert near(top_alone, "van").sum() > 100
     assert not near(top_alone, "pedestrian").any()
     assert points_alone.shape[1] == top_alone.shape[1] == 1600
+    said = [call.args[4] for call in headings.call_args_list if call.args[3] == "as the sensor sees it"]
+    assert said == ["90° ahead, a class for every point", "90° ahead"]
 
 
 @pytest.mark.usefixtures("matplotlib")
