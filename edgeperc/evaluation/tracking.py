@@ -345,6 +345,8 @@ def evaluate_kitti(
     ------
     TrackingError
         There is no such data, or a file is malformed, or there are no such rules, or ``iou_threshold`` is not in 0..1.
+    PointsError
+        A file of labels or detections cannot be read, or is no text.
     """
     if rules not in RULES:
         raise TrackingError(f"got rules {rules!r}; expected one of {', '.join(RULES)}")
