@@ -173,7 +173,8 @@ class RollingGrid:
         masks = [grid.unknown, grid.obstacle, grid.drivable, grid.judged]
         kinds = np.select(masks, (_NOTHING, _OBSTACLE, _ROAD, _OFF_ROAD), _GROUND).astype(np.uint8)
         movable = self._movable(perception, points, tracks)
-        new = copy.deepcopy(self)  # an update that a signal ends changes nothing
+        new = copy.copy(self)  # an update that a signal ends changes nothing
+        new._kind, new._seen_s, new._fleeting = self._kind.copy(), self._seen_s.copy(), self._fleeting.copy()
         if step != "next":
             new.reset()
         new._clock, new._z_m = clock, z_m

@@ -20,7 +20,7 @@ from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
-from ..types.perception import Box
+from ..types.perception import Box, Perception
 from ..types.points import Floats
 from ..view.content import edges_ahead
 from .run_file import RunFile, ScanFiles, stem_of, warn_of
@@ -53,8 +53,7 @@ class _Item(NamedTuple):
     """What labels need of a scan."""
 
     name: str
-    boxes: tuple[Box, ...]
-    origin_m: tuple[float, float, float] | None
+    perception: Perception  # without what holds points, cells or pixels
     image_size: tuple[int, int] | None  # width and height [px] of an image that was perceived with it
 
 
@@ -127,7 +126,8 @@ class PrelabelSink:
         """
         image = scan.perception.image
         size = None if image is None else (image.labels.shape[1], image.labels.shape[0])
-        item = _Item(scan.name, scan.perception.boxes, scan.perception.origin_m, size)
+        light = replace(scan.perception, points=None, top_view=None, image=None, ground=None)
+        item = _Item(scan.name, light, size)
         if scan.tracks is None or scan.health is not None:
             tracked = None if scan.tracked is None else [track for track in scan.tracked if not track.coasting]
             self._write_boxes(item, tracked)
@@ -150,13 +150,12 @@ class PrelabelSink:
                 self._errors.append(exc)
 
     def _write_boxes(self, item: _Item, tracks: Sequence[Track] | None) -> None:
-        boxes: list[Named] = [(box, None) for box in item.boxes]
+        boxes: list[Named] = [(box, None) for box in item.perception.boxes]
         if tracks is not None:
             boxes = [(track.box, track.id) for track in tracks]
-        if item.origin_m is not None and self._kind != "kitti":
-            x, y, z = item.origin_m
-            places = [(box.center[0] + x, box.center[1] + y, box.center[2] + z) for box, _ in boxes]
-            boxes = [(replace(box, center=place), number) for (box, number), place in zip(boxes, places, strict=True)]
+        if item.perception.origin_m is not None and self._kind != "kitti":
+            placed = item.perception.in_map(box for box, _ in boxes)
+            boxes = [(box, number) for box, (_, number) in zip(placed, boxes, strict=True)]
         for box, _ in boxes:
             self._number(box.label)
         self._writer(stem_of(item.name)[0], item, boxes)
@@ -262,7 +261,7 @@ class PrelabelSink:
             size = scan.image_size or size
             warn_off_center(P2, *size, "2-D boxes are cut to it. Pass the scans as --scan of their images")
             text = path.read_text("utf-8") if path.is_file() else ""
-        origin, T_cam_file = scan.origin_m, T_cam_sensor.copy()
+        origin, T_cam_file = scan.perception.origin_m, T_cam_sensor.copy()
         T_cam_file[:3, 3] -= T_cam_sensor[:3, :3] @ (origin or (0.0, 0.0, 0.0))
         if origin or not ("R0_rect" in text and "Tr_velo_to_cam" in text):  # readers of objects know no other names
             rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_file[:3]}

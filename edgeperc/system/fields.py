@@ -48,15 +48,14 @@ class Fields:
         """Raise the error of a wrong entry."""
         raise self.error(f"{name} is {reprlib.repr(value)}; expected {expected}")
 
-    def each(self, name: str, values: Any, *kinds: type[T]) -> tuple[T, ...]:
-        """Objects of some types."""
-        names = " or ".join(kind.__name__ for kind in kinds)
+    def each(self, name: str, values: Any, kind: type[T]) -> tuple[T, ...]:
+        """Objects of a type."""
         if not hasattr(values, "__iter__"):
-            self.refuse(name, values, f"{names} objects")
+            self.refuse(name, values, f"{kind.__name__} objects")
         given = tuple(values)
         for index, value in enumerate(given):
-            if not isinstance(value, kinds):
-                self.refuse(f"{name}[{index}]", value, f"a {names}")
+            if not isinstance(value, kind):
+                self.refuse(f"{name}[{index}]", value, f"a {kind.__name__}")
         return given
 
     def number(self, name: str, value: Any, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:

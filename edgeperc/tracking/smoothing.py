@@ -62,8 +62,9 @@ def _smoothed(online: Sequence[Tracks], reported: Ints64) -> list[Tracks]:
     after, after_s, found, seen = np.zeros(0, TRACK), math.inf, [], np.zeros(0, np.int64)
     for tracks in reversed(online):
         rows = tracks.every[np.isin(tracks.every["id"], reported)]
-        rows = rows[(rows["misses"] == 0) | np.isin(rows["id"], after["id"])]
         goes_on = np.isin(rows["id"], after["id"])
+        begun = goes_on | (rows["misses"] == 0)
+        rows, goes_on = rows[begun], goes_on[begun]
         later = after[np.isin(after["id"], rows["id"])]  # ids rise in every scan
         is_reused = np.isin(rows["id"][~goes_on], seen).any() or (later["age_s"] <= rows["age_s"][goes_on]).any()
         if not tracks.stamp_s < after_s or is_reused or tracks.class_names != names[: len(tracks.class_names)]:
