@@ -111,14 +111,15 @@ FLOORS = {
         evaluation.predictions evaluation.tables
         evaluation.truth
         evaluation.judge
-        evaluation.camvid evaluation.evaluate evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.consistency evaluation.evaluate evaluation.tracking evaluation.transfer
         ros2.__init__ ros2.graph ros2.messages
         ros2.odometry
         ros2.node ros2.rclpy_graph ros2.zenoh_graph
         sinks.__init__ sinks.relay sinks.run_file sinks.scene
         sinks.foxglove sinks.page sinks.prelabels sinks.rerun sinks.rosbag sinks.static
         cli.arguments cli.evaluation.__init__ cli.output cli.straighten
-        cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.lists cli.program
+        cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.evaluation.unlabeled
+        cli.lists cli.program
         cli.report cli.scans cli.sinks
         cli.cvat cli.evaluation.sensors cli.fit_sensor cli.info cli.outputs cli.side_by_side
         cli.evaluation.scans cli.run

@@ -239,7 +239,7 @@ def run_command(arguments: argparse.Namespace) -> int:
                 "name that is free in one that can be written"
             ) from exc
     gif = arguments.out / "tracks.gif" if arguments.gif else None
-    make_places(arguments.mcap, arguments.rrd, arguments.play, gif)
+    make_places(arguments.mcap, arguments.rrd, arguments.play, arguments.consistency, gif)
     report = Report(arguments, images)
     for folder in found.empty:
         has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
@@ -300,6 +300,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--bag-storage and --bag-frame need --bag DIR")
     if arguments.gif and not arguments.track:
         arguments.usage_error("--gif needs --track")
+    if arguments.consistency is not None and (arguments.live or not arguments.track):
+        arguments.usage_error("--consistency needs --track, and no --live: it is of a whole drive")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:

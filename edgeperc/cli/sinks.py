@@ -12,7 +12,7 @@ from ..records import PerceivedScan, Sink
 from .arguments import options
 from .output import print_error, print_line
 
-SINKS = ("mcap", "serve", "rrd", "play", "static", "labels_for", "bag")
+SINKS = ("mcap", "serve", "rrd", "play", "static", "labels_for", "bag", "consistency")
 """Names of the options below as attributes of the arguments."""
 
 
@@ -63,6 +63,12 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         choices=("sqlite3", "mcap"),
     )
     group("--bag-frame NAME", "frame of the messages in --bag (default: lidar)")
+    group(
+        "--consistency FILE",
+        "write figures of the drive without labels as JSON, and print them: in how many of the scans that show an "
+        "object it was detected, by class and distance, and how steady its class and heading were. Needs --track "
+        "(default: none)",
+    )
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -138,6 +144,10 @@ class Sinks:
         if arguments.bag is not None:
             storage: Literal["sqlite3", "mcap"] = arguments.bag_storage or "sqlite3"
             self._add(BagSink(arguments.bag, storage=storage, frame_id=arguments.bag_frame or "lidar"))
+        if arguments.consistency is not None:
+            from .evaluation.unlabeled import ConsistencySink  # it loads numba
+
+            self._add(ConsistencySink(arguments.consistency))
 
     def _add(self, sink: Sink) -> None:
         """The first is closed last: files are finished before what is served ends, whatever viewers do."""

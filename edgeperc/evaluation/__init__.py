@@ -5,5 +5,6 @@ sensor, `splits` lists the drives for training, validation and testing, `truth` 
 `judge` compares one perception with it, and `tables` computes the figures of all scans, with intervals. `metrics`
 counts labels and matches boxes. `unseen` raises an error for scans that a model was trained on, and `mistakes`
 describes the errors of a scan for a picture. `camvid` evaluates camera models on labeled images. `transfer` evaluates a
-model on other sensors. `tracking` evaluates the tracker on KITTI's sequences, by `tracking_metrics`.
+model on other sensors. `tracking` evaluates the tracker on KITTI's sequences, by `tracking_metrics`. `consistency`
+needs no labels.
 """

@@ -70,11 +70,11 @@ class ModelFrame:
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
-        return tuple(boxes) if self.is_identity else _moved(boxes, self.R, self.t)
+        return tuple(boxes) if self.is_identity else moved_boxes(boxes, self.R, self.t)
 
     def boxes_back(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the models' frame in the frame of the scan."""
-        return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
+        return tuple(boxes) if self.is_identity else moved_boxes(boxes, self.R.T, -self.R.T @ self.t)
 
 
 OF_MODELS = ModelFrame(MODEL_MOUNTING)
@@ -133,7 +133,8 @@ def _moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Fl
     return read_only(moved)
 
 
-def _moved(boxes: Iterable[Box], R: Floats, t: Floats) -> tuple[Box, ...]:
+def moved_boxes(boxes: Iterable[Box], R: Floats, t: Floats) -> tuple[Box, ...]:
+    """Boxes whose centers p lie at ``R p + t`` [m], with the headings that R gives them; they stay upright."""
     moved = []
     for box in boxes:
         x, y, z = (R @ np.array(box.center) + t).tolist()

@@ -1,0 +1,223 @@
+"""Figures of a drive without labels: each scan's answer, held against what all scans of the drive say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..ground.planes import heights_above
+from ..system.fields import OPTIONS
+from ..tracking.smoothing import smooth_tracks
+from ..tracking.tracks import Track, Tracks
+from ..types.choices import VEHICLES
+from ..types.frame import ModelFrame, moved_boxes
+from ..types.geometry import inside, wrapped
+from ..types.perception import Box, Perception, scan_of
+from ..types.points import Floats32
+from .metrics import FEWEST_RETURNS
+from .tables import within
+
+__all__ = ["Consistency"]
+
+_BANDS = {"all": (0.0, math.inf), **{f"{low}-{low + 15} m": (low, low + 15.0) for low in (0, 15, 30, 45)}}
+# A vehicle stands if its places, in so many scans with a detection, are this close together along x and y. It is then
+# looked for in the scans of a time before and after, up to a distance, by returns at these heights above the ground.
+_STANDS_M, _STANDS_SCANS = 1.0, 5
+_LOOK_S, _LOOK_M, _OVER_GROUND_M = 3.0, 80.0, (0.3, 4.0)
+_CELL_M = 0.2  # in which returns are counted: the view ahead then takes 60 kB a scan, a full turn 240
+
+
+class Consistency:
+    """How consistent the answers of a drive are: what takes no labels to see.
+
+    The tracks of the whole drive (`edgeperc.smooth_tracks`) stand for the truth. A vehicle that stands must also be
+    detected in the scans of 3 s before its first and after its last detection, if it returns three points in view. An
+    object that was never tracked is in no figure, so a share ``detected`` tends to be above the true recall.
+
+    Examples
+    --------
+    >>> consistency = Consistency()                                             # doctest: +SKIP
+    >>> for stamp_s, points in scans:                                           # doctest: +SKIP
+    ...     perception = perceive(points, stamp_s)
+    ...     consistency.add(perception, points, tracker(perception))
+    >>> consistency.figures()["classes"]["car"]["30-45 m"]["detected"]          # doctest: +SKIP
+    0.82
+    """
+
+    def __init__(self) -> None:
+        self._scans: list[_Scan] = []
+
+    def add(self, perception: Perception, points: ArrayLike, tracks: Tracks) -> None:
+        """Take in the next scan. One that came late or twice does not count.
+
+        Parameters
+        ----------
+        perception : Perception
+        points : (n, 3 or 4) array_like
+            The scan that was perceived.
+        tracks : Tracks
+            What one `Tracker` returned for the perception.
+
+        Raises
+        ------
+        OptionError, PointsError
+            One of them is something else.
+        """
+        counted = _counted(perception, points)
+        (tracks,) = OPTIONS.each("tracks", (tracks,), Tracks)
+        if not tracks.is_late:
+            self._scans.append(_Scan(perception.boxes, tracks, counted))
+
+    def figures(self) -> dict[str, Any]:
+        """Compute the figures of the scans so far.
+
+        Returns
+        -------
+        dict
+            ``n_scans``, ``n_drives`` (sessions of the tracker), and ``classes``: by class of the track or of the
+            detection, and by distance (``"all"``, ``"0-15 m"``, ``"15-30 m"``, ``"30-45 m"``, ``"45-60 m"``):
+
+            - ``n_objects`` that are in ``n_scans`` scans altogether; ``detected``, the share of these scans in which
+              the object was detected; of its detections, the shares with the ``class`` of its track, and with its
+              ``heading`` within 90 degrees;
+            - ``n_detections``, and the share of them that are ``lone``: where there is no track.
+
+            A share of nothing is None.
+
+        Raises
+        ------
+        TrackingError
+            The tracks are not those of one recording in order.
+        """
+        smoothed = smooth_tracks(scan.tracks for scan in self._scans)
+        sights = [*_tracked(self._scans, smoothed), *_standing(self._scans, smoothed)]
+        detections = [
+            _Detection(box.label, _range(box), k not in tracks.sources and not _is_covered(box, tracks))
+            for scan, tracks in zip(self._scans, smoothed, strict=True)
+            for k, box in enumerate(scan.boxes)
+        ]
+        classes = {
+            label: {
+                band: _row(
+                    [sight for sight in sights if sight.label == label and within(sight.range_m, limits)],
+                    [box for box in detections if box.label == label and within(box.range_m, limits)],
+                )
+                for band, limits in _BANDS.items()
+            }
+            for label in sorted({sight.label for sight in sights} | {box.label for box in detections})
+        }
+        n_drives = len({scan.tracks.session for scan in self._scans})
+        return {"n_scans": len(self._scans), "n_drives": n_drives, "classes": classes}
+
+
+class _Scan(NamedTuple):
+    boxes: tuple[Box, ...]
+    tracks: Tracks
+    counted: Floats32  # (k, 4): centers of cells in the frame of the scan [m], and the number of returns in each
+
+
+class _Sight(NamedTuple):
+    """An object in a scan; of its own detection there, whether it has the class and the heading of the object."""
+
+    label: str
+    range_m: float
+    number: int
+    is_detected: bool
+    has_class: bool | None = None
+    has_heading: bool | None = None
+
+
+class _Detection(NamedTuple):
+    label: str
+    range_m: float
+    is_lone: bool
+
+
+def _counted(perception: Perception, points: ArrayLike) -> Floats32:
+    """Returns in view that are not on the ground, by cells."""
+    seen = scan_of(perception, points)
+    if perception.points is not None:
+        seen = seen[perception.points.in_view]
+    seen = seen[np.abs(seen[:, :3]).max(axis=1) < _LOOK_M]  # finite, too
+    low, high = _OVER_GROUND_M
+    above_m = heights_above(perception.ground, ModelFrame(perception.mounting).move(seen)).height_m
+    cell = np.floor(seen[(above_m > low) & (above_m < high), :3] / _CELL_M).astype(np.int64) + 512  # 0..1023
+    number, counts = np.unique(cell @ (1 << 20, 1 << 10, 1), return_counts=True)
+    cells = np.column_stack([number >> 20, number >> 10 & 1023, number & 1023]) - 512
+    return np.column_stack([(cells + 0.5) * _CELL_M, counts]).astype(np.float32)
+
+
+def _tracked(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
+    """Objects from their first to their last detection."""
+    for scan, tracks in zip(scans, smoothed, strict=True):
+        for track, source in zip(tracks, tracks.sources.tolist(), strict=True):
+            label, range_m = track.label, _range(track.box)
+            if source < 0:
+                yield _Sight(label, range_m, track.id, any(_covers(track.box, box) for box in scan.boxes))
+            else:
+                own = scan.boxes[source]
+                is_ahead = abs(wrapped(own.yaw - track.yaw)) < 0.5 * math.pi
+                yield _Sight(label, range_m, track.id, True, own.label == label, is_ahead)
+
+
+def _standing(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
+    """Vehicles that stand, in the scans before their first and after their last detection that show them."""
+    lives: dict[int, list[tuple[int, Track]]] = {}
+    for k, tracks in enumerate(smoothed):
+        for track in tracks:
+            lives.setdefault(track.id, []).append((k, track))
+    for number, life in lives.items():
+        is_vehicle, n_seen = life[0][1].label in VEHICLES, sum(not track.coasting for _, track in life)
+        places = np.array([track.world_box.center[:2] for _, track in life])
+        if not is_vehicle or n_seen < _STANDS_SCANS or np.ptp(places, axis=0).max() > _STANDS_M:
+            continue
+        (first, early), (last, late) = life[0], life[-1]
+        for end, others in ((early, range(first - 1, -1, -1)), (late, range(last + 1, len(scans)))):
+            at = smoothed[first if end is early else last]
+            for k in others:
+                tracks = smoothed[k]
+                if tracks.session != at.session or abs(tracks.stamp_s - at.stamp_s) > _LOOK_S:
+                    break
+                R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
+                (box,) = moved_boxes([end.world_box], R.T, -R.T @ t)
+                n_returns = scans[k].counted[inside(box, scans[k].counted), 3].sum()
+                if n_returns >= FEWEST_RETURNS and not _is_covered(box, tracks):
+                    is_detected = any(_covers(box, detection) for detection in scans[k].boxes)
+                    yield _Sight(end.label, _range(box), number, is_detected)
+
+
+def _range(box: Box) -> float:
+    return math.hypot(*box.center[:2])
+
+
+def _covers(box: Box, other: Box) -> bool:
+    """Whether the center of another box lies in the footprint of one."""
+    (x, y, _), (u, v, _) = box.center, other.center
+    cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+    along, across = (u - x) * cos + (v - y) * sin, (v - y) * cos - (u - x) * sin
+    return abs(along) <= 0.5 * box.size[0] and abs(across) <= 0.5 * box.size[1]
+
+
+def _is_covered(box: Box, tracks: Tracks) -> bool:
+    return any(_covers(track.box, box) for track in tracks)
+
+
+def _row(sights: Sequence[_Sight], detections: Sequence[_Detection]) -> dict[str, Any]:
+    own = [sight for sight in sights if sight.has_class is not None]
+    return {
+        "n_objects": len({sight.number for sight in sights}),
+        "n_scans": len(sights),
+        "detected": _share([sight.is_detected for sight in sights]),
+        "class": _share([sight.has_class for sight in own]),
+        "heading": _share([sight.has_heading for sight in own]),
+        "n_detections": len(detections),
+        "lone": _share([box.is_lone for box in detections]),
+    }
+
+
+def _share(marks: Sequence[bool | None]) -> float | None:
+    return sum(map(bool, marks)) / len(marks) if marks else None
