@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -51,7 +52,7 @@ class Consistency:
     def __init__(self) -> None:
         self._scans: list[_Scan] = []
 
-    def add(self, perception: Perception, points: ArrayLike, tracks: Tracks) -> None:
+    def add(self, perception: Perception, points: ArrayLike, tracks: Tracks, name: str = "") -> None:
         """Take in the next scan. One that came late or twice does not count.
 
         Parameters
@@ -61,6 +62,8 @@ class Consistency:
             The scan that was perceived.
         tracks : Tracks
             What one `Tracker` returned for the perception.
+        name : str
+            Of the scan, for the figures.
 
         Raises
         ------
@@ -70,7 +73,7 @@ class Consistency:
         counted = _counted(perception, points)
         (tracks,) = OPTIONS.each("tracks", (tracks,), Tracks)
         if not tracks.is_late:
-            self._scans.append(_Scan(perception.boxes, tracks, counted))
+            self._scans.append(_Scan(name, perception.boxes, tracks, counted))
 
     def figures(self) -> dict[str, Any]:
         """Compute the figures of the scans so far.
@@ -86,7 +89,8 @@ class Consistency:
               ``heading`` within 90 degrees;
             - ``n_detections``, and the share of them that are ``lone``: where there is no track.
 
-            A share of nothing is None.
+            A share of nothing is None. ``scans`` has for each its name as ``scan``, and the numbers of objects that
+            were ``missed`` in it and of ``lone`` detections: those with most are worth a look, or labels, first.
 
         Raises
         ------
@@ -96,9 +100,9 @@ class Consistency:
         smoothed = smooth_tracks(scan.tracks for scan in self._scans)
         sights = [*_tracked(self._scans, smoothed), *_standing(self._scans, smoothed)]
         detections = [
-            _Detection(box.label, _range(box), k not in tracks.sources and not _is_covered(box, tracks))
-            for scan, tracks in zip(self._scans, smoothed, strict=True)
-            for k, box in enumerate(scan.boxes)
+            _Detection(k, box.label, _range(box), n not in tracks.sources and not _is_covered(box, tracks))
+            for k, (scan, tracks) in enumerate(zip(self._scans, smoothed, strict=True))
+            for n, box in enumerate(scan.boxes)
         ]
         classes = {
             label: {
@@ -111,10 +115,14 @@ class Consistency:
             for label in sorted({sight.label for sight in sights} | {box.label for box in detections})
         }
         n_drives = len({scan.tracks.session for scan in self._scans})
-        return {"n_scans": len(self._scans), "n_drives": n_drives, "classes": classes}
+        missed = Counter(sight.scan for sight in sights if not sight.is_detected)
+        lone = Counter(box.scan for box in detections if box.is_lone)
+        scans = [{"scan": scan.name, "missed": missed[k], "lone": lone[k]} for k, scan in enumerate(self._scans)]
+        return {"n_scans": len(scans), "n_drives": n_drives, "classes": classes, "scans": scans}
 
 
 class _Scan(NamedTuple):
+    name: str
     boxes: tuple[Box, ...]
     tracks: Tracks
     counted: Floats32  # (k, 4): centers of cells in the frame of the scan [m], and the number of returns in each
@@ -123,6 +131,7 @@ class _Scan(NamedTuple):
 class _Sight(NamedTuple):
     """An object in a scan; of its own detection there, whether it has the class and the heading of the object."""
 
+    scan: int
     label: str
     range_m: float
     number: int
@@ -132,6 +141,7 @@ class _Sight(NamedTuple):
 
 
 class _Detection(NamedTuple):
+    scan: int
     label: str
     range_m: float
     is_lone: bool
@@ -153,15 +163,15 @@ def _counted(perception: Perception, points: ArrayLike) -> Floats32:
 
 def _tracked(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
     """Objects from their first to their last detection."""
-    for scan, tracks in zip(scans, smoothed, strict=True):
+    for k, (scan, tracks) in enumerate(zip(scans, smoothed, strict=True)):
         for track, source in zip(tracks, tracks.sources.tolist(), strict=True):
-            label, range_m = track.label, _range(track.box)
+            of_track = k, track.label, _range(track.box), track.id
             if source < 0:
-                yield _Sight(label, range_m, track.id, any(_covers(track.box, box) for box in scan.boxes))
+                yield _Sight(*of_track, any(_covers(track.box, box) for box in scan.boxes))
             else:
                 own = scan.boxes[source]
                 is_ahead = abs(wrapped(own.yaw - track.yaw)) < 0.5 * math.pi
-                yield _Sight(label, range_m, track.id, True, own.label == label, is_ahead)
+                yield _Sight(*of_track, True, own.label == track.label, is_ahead)
 
 
 def _standing(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
@@ -187,7 +197,7 @@ def _standing(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_S
                 n_returns = scans[k].counted[inside(box, scans[k].counted), 3].sum()
                 if n_returns >= FEWEST_RETURNS and not _is_covered(box, tracks):
                     is_detected = any(_covers(box, detection) for detection in scans[k].boxes)
-                    yield _Sight(end.label, _range(box), number, is_detected)
+                    yield _Sight(k, end.label, _range(box), number, is_detected)
 
 
 def _range(box: Box) -> float:

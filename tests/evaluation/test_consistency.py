@@ -64,7 +64,7 @@ def test_figures_are_those_counted_by_hand() -> None:
         boxes += [Box("pedestrian", 0.5, (8.0, -9.0, -0.9), (0.8, 0.6, 1.7), 0.0)] if k == 3 else []
         points = points_on(PARKED, n=12 if k >= 2 else 2)
         perception = perceived(points, 0.1 * k, *boxes)
-        consistency.add(perception, points, tracker(perception, STANDING))
+        consistency.add(perception, points, tracker(perception, STANDING), f"scan {k}")
     with pytest.warns(UserWarning, match="late or doubled"):
         consistency.add(perception, points, tracker(perception, STANDING))
     figures = consistency.figures()
@@ -77,6 +77,8 @@ def test_figures_are_those_counted_by_hand() -> None:
     }
     assert figures["classes"]["van"]["all"] == {**NOWHERE, "n_detections": 1, "lone": 0.0}
     assert figures["classes"]["pedestrian"]["0-15 m"] == {**NOWHERE, "n_detections": 1, "lone": 1.0}
+    missed = {2, 3, 4, 5, 12, 18, 19}
+    assert figures["scans"] == [{"scan": f"scan {k}", "missed": k in missed, "lone": k == 3} for k in range(20)]
 
 
 @pytest.mark.parametrize("far_m", [0.0, 5e6])
@@ -111,7 +113,7 @@ def test_errors_name_the_reason() -> None:
     consistency, points = Consistency(), points_on()
     perception = perceived(points, 0.0)
     tracks = Tracker()(perception)
-    assert consistency.figures() == {"n_scans": 0, "n_drives": 0, "classes": {}}
+    assert consistency.figures() == {"n_scans": 0, "n_drives": 0, "classes": {}, "scans": []}
     for bad, error in [
         ((None, points, tracks), OptionError),
         ((perception, points[:5], tracks), PointsError),
@@ -144,6 +146,7 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.
     assert "consistency of 10 scans of 1 drive, without labels [%]\n" in printed
     (line,) = (line for line in printed.splitlines() if line.split()[:2] == ["car", "all"])
     assert line.split()[2:] == ["1", "10", "60.0", "100.0", "100.0", "6", "0.0"]
+    assert f"look first at {drive}/000000.bin (1 missed, 0 lone), " in printed
     assert json.loads(file.read_text())["classes"]["car"]["15-30 m"]["detected"] == 0.6
     printed = shell.err("run", drive / "000000.bin", "--sensor", "hdl-64e", "--track", "--consistency", file, code=0)
     assert "consistency of 1 scan of 1 drive, without labels [%]: nothing was detected" in printed

@@ -27,7 +27,7 @@ class ConsistencySink:
     def write(self, scan: PerceivedScan) -> None:
         """Take in a scan; of a late one nothing is known. Raises OptionError, PointsError."""
         if scan.tracks is not None:
-            self._consistency.add(scan.perception, scan.points, scan.tracks)
+            self._consistency.add(scan.perception, scan.points, scan.tracks, scan.name)
 
     def close(self, whole: bool = True) -> None:
         """Write the figures; see `Sink.close`."""
@@ -44,5 +44,8 @@ class ConsistencySink:
         ]
         scans, drives = many(figures["n_scans"], "scan"), many(figures["n_drives"], "drive")
         title = f"consistency of {scans} of {drives}, without labels [%]"
-        for line in table_lines(title, _COLUMNS, rows) or [f"{title}: nothing was detected"]:
+        worst = sorted(figures["scans"], key=lambda scan: -scan["missed"] - scan["lone"])[:3]
+        named = [f"{scan['scan']} ({scan['missed']} missed, {scan['lone']} lone)" for scan in worst]
+        lines = [*table_lines(title, _COLUMNS, rows), f"look first at {', '.join(named)}"]
+        for line in lines if rows else [f"{title}: nothing was detected"]:
             print_line(line, sys.stderr)
