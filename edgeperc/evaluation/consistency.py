@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from ..ground.planes import heights_above
 from ..system.fields import OPTIONS
 from ..tracking.smoothing import smooth_tracks
-from ..tracking.tracks import Track, Tracks
+from ..tracking.tracks import Tracks
 from ..types.choices import VEHICLES
 from ..types.frame import ModelFrame, moved_boxes
 from ..types.geometry import inside, wrapped
 from ..types.perception import Box, Perception, scan_of
-from ..types.points import Floats32
+from ..types.points import Floats, Floats32, Mask
 from .metrics import FEWEST_RETURNS
 from .tables import within
 
@@ -99,11 +99,7 @@ class Consistency:
         """
         smoothed = smooth_tracks(scan.tracks for scan in self._scans)
         sights = [*_tracked(self._scans, smoothed), *_standing(self._scans, smoothed)]
-        detections = [
-            _Detection(k, box.label, _range(box), n not in tracks.sources and not _is_covered(box, tracks))
-            for k, (scan, tracks) in enumerate(zip(self._scans, smoothed, strict=True))
-            for n, box in enumerate(scan.boxes)
-        ]
+        detections = [*_detections(self._scans, smoothed)]
         classes = {
             label: {
                 band: _row(
@@ -161,59 +157,61 @@ def _counted(perception: Perception, points: ArrayLike) -> Floats32:
     return np.column_stack([(cells + 0.5) * _CELL_M, counts]).astype(np.float32)
 
 
+def _detections(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Detection]:
+    for k, (scan, tracks) in enumerate(zip(scans, smoothed, strict=True)):
+        is_lone = np.asarray(~_covers(tracks.boxes, scan.boxes).any(axis=0))
+        is_lone[tracks.sources[tracks.sources >= 0]] = False
+        for box, mark in zip(scan.boxes, is_lone.tolist(), strict=True):
+            yield _Detection(k, box.label, math.hypot(*box.center[:2]), mark)
+
+
 def _tracked(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
     """Objects from their first to their last detection."""
     for k, (scan, tracks) in enumerate(zip(scans, smoothed, strict=True)):
-        for track, source in zip(tracks, tracks.sources.tolist(), strict=True):
-            of_track = k, track.label, _range(track.box), track.id
+        is_near = np.asarray(_covers(tracks.boxes, scan.boxes).any(axis=1))
+        away_m = np.hypot(tracks.boxes[:, 0], tracks.boxes[:, 1])
+        for n, (label, source) in enumerate(zip(tracks.labels, tracks.sources.tolist(), strict=True)):
+            of_track = k, label, float(away_m[n]), int(tracks.ids[n])
             if source < 0:
-                yield _Sight(*of_track, any(_covers(track.box, box) for box in scan.boxes))
+                yield _Sight(*of_track, bool(is_near[n]))
             else:
                 own = scan.boxes[source]
-                is_ahead = abs(wrapped(own.yaw - track.yaw)) < 0.5 * math.pi
-                yield _Sight(*of_track, True, own.label == track.label, is_ahead)
+                is_ahead = abs(wrapped(own.yaw - float(tracks.boxes[n, 6]))) < 0.5 * math.pi
+                yield _Sight(*of_track, True, own.label == label, is_ahead)
 
 
 def _standing(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_Sight]:
     """Vehicles that stand, in the scans before their first and after their last detection that show them."""
-    lives: dict[int, list[tuple[int, Track]]] = {}
+    lives: dict[int, list[tuple[int, int]]] = {}  # scan and number in it
     for k, tracks in enumerate(smoothed):
-        for track in tracks:
-            lives.setdefault(track.id, []).append((k, track))
+        for n, number in enumerate(tracks.ids.tolist()):
+            lives.setdefault(number, []).append((k, n))
     for number, life in lives.items():
-        is_vehicle, n_seen = life[0][1].label in VEHICLES, sum(not track.coasting for _, track in life)
-        places = np.array([track.world_box.center[:2] for _, track in life])
-        if not is_vehicle or n_seen < _STANDS_SCANS or np.ptp(places, axis=0).max() > _STANDS_M:
+        n_seen = sum(smoothed[k].sources[n] >= 0 for k, n in life)
+        places = np.array([smoothed[k].rows["state"][n, :2] for k, n in life])
+        if n_seen < _STANDS_SCANS or np.ptp(places, axis=0).max() > _STANDS_M:
             continue
-        (first, early), (last, late) = life[0], life[-1]
-        for end, others in ((early, range(first - 1, -1, -1)), (late, range(last + 1, len(scans)))):
-            at = smoothed[first if end is early else last]
-            for k in others:
-                tracks = smoothed[k]
-                if tracks.session != at.session or abs(tracks.stamp_s - at.stamp_s) > _LOOK_S:
+        (first, _), (last, _) = life[0], life[-1]
+        for (of, n), others in ((life[0], range(first - 1, -1, -1)), (life[-1], range(last + 1, len(scans)))):
+            end = smoothed[of][n]
+            for k in others if end.label in VEHICLES else ():
+                tracks, scan = smoothed[k], scans[k]
+                if tracks.session != smoothed[of].session or abs(tracks.stamp_s - smoothed[of].stamp_s) > _LOOK_S:
                     break
                 R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
                 (box,) = moved_boxes([end.world_box], R.T, -R.T @ t)
-                n_returns = scans[k].counted[inside(box, scans[k].counted), 3].sum()
-                if n_returns >= FEWEST_RETURNS and not _is_covered(box, tracks):
-                    is_detected = any(_covers(box, detection) for detection in scans[k].boxes)
-                    yield _Sight(k, end.label, _range(box), number, is_detected)
+                n_returns = scan.counted[inside(box, scan.counted), 3].sum()
+                if n_returns >= FEWEST_RETURNS and not _covers(tracks.boxes, [box]).any():
+                    is_detected = bool(_covers(np.array([[*box.center, *box.size, box.yaw]]), scan.boxes).any())
+                    yield _Sight(k, end.label, math.hypot(*box.center[:2]), number, is_detected)
 
 
-def _range(box: Box) -> float:
-    return math.hypot(*box.center[:2])
-
-
-def _covers(box: Box, other: Box) -> bool:
-    """Whether the center of another box lies in the footprint of one."""
-    (x, y, _), (u, v, _) = box.center, other.center
-    cos, sin = math.cos(box.yaw), math.sin(box.yaw)
-    along, across = (u - x) * cos + (v - y) * sin, (v - y) * cos - (u - x) * sin
-    return abs(along) <= 0.5 * box.size[0] and abs(across) <= 0.5 * box.size[1]
-
-
-def _is_covered(box: Box, tracks: Tracks) -> bool:
-    return any(_covers(track.box, box) for track in tracks)
+def _covers(rows: Floats, boxes: Sequence[Box]) -> Mask:
+    """Whether the footprint of each row, as of `Tracks.boxes`, covers the center of each box, (rows, boxes)."""
+    centers = np.array([box.center for box in boxes]).reshape(-1, 3)
+    (x, y), yaw = (centers[:, :2] - rows[:, None, :2]).transpose(2, 0, 1), rows[:, 6:]
+    along, across = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
+    return (np.abs(along) <= 0.5 * rows[:, 3:4]) & (np.abs(across) <= 0.5 * rows[:, 4:5])
 
 
 def _row(sights: Sequence[_Sight], detections: Sequence[_Detection]) -> dict[str, Any]:
