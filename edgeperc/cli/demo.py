@@ -64,8 +64,10 @@ def demo_command(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from .. import view
+    from ..datasets.layout import numbers_of_scene
     from ..ground.leveling import FROZEN_AFTER
     from ..simulation.drawn import random_scene
+    from ..simulation.samples import labels_of_scene
     from ..simulation.scene import simulate
     from ..zoo import shipped_models
 
@@ -92,7 +94,8 @@ def demo_command(arguments: argparse.Namespace) -> int:
     texts = [_box_text(box) for box in perception.boxes] or ["none"]
     rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
-        true = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
+        labels = numbers_of_scene(perception.points.classes)[labels_of_scene(scan)]
+        true = np.bincount(labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
             rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (true: {true[k]:,})"))
     total_ms = sum(perception.stage_ms.values())
