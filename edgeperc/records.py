@@ -96,15 +96,16 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
 def read_boxes(path: Path | str, frames: Mapping[str, int] | None = None) -> list[list[Box]]:
     """Read the boxes of a drive by frame, in the sensor frame, as ``edgeperc run --json`` prints them. The frame is
     that of the scan's name without suffix in ``frames``, else the number at the end of its name, or the line's, if some
-    scan has no number. Warns of frames between others that have no line. Raises TrackingError, OSError.
+    scan has no number. Warns of frames that have no line, or that of a scan that failed. Raises TrackingError, OSError.
     """
     from .types.perception import Box
 
-    scans, boxes = list[str](), list[list[Box]]()
+    scans, boxes = list[str](), list[list[Box] | None]()
     try:
         for line in Path(path).read_text(encoding="utf-8").splitlines():
             record = json.loads(line)
-            boxes.append([Box.from_dict(box) for box in record["boxes"]])
+            has_failed = {"scan", "error"} <= {*record}
+            boxes.append(None if has_failed else [Box.from_dict(box) for box in record["boxes"]])
             scans.append(str(record.get("scan")))
     except (KeyError, RecursionError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc
@@ -118,15 +119,15 @@ def read_boxes(path: Path | str, frames: Mapping[str, int] | None = None) -> lis
         if frame < 0 or other != line_number:
             what = "is none of the sequence" if frame < 0 else f"has the frame of {scans[other]}, {frame}"
             raise TrackingError(f"{path}: {scan} {what}; expected one line for each scan of one sequence")
-    last = max(by_frame, default=-1)
-    if len(by_frame) <= last:
-        first = next(frame for frame in range(last) if frame not in by_frame)
+    n_frames = 1 + max(by_frame, default=-1)
+    in_order = [boxes[by_frame[frame]] if frame in by_frame else None for frame in range(n_frames)]
+    if lacking := [frame for frame, of_frame in enumerate(in_order) if of_frame is None]:
         warnings.warn(
-            f"{path} has no line for {last + 1 - len(by_frame)} of {last + 1} frames, such as {first}; they count as "
-            "frames without boxes",
+            f"{path} has no line with boxes for {len(lacking)} of {n_frames} frames, such as {lacking[0]}; they count "
+            "as frames without boxes",
             stacklevel=2,
         )
-    return [boxes[by_frame[frame]] if frame in by_frame else [] for frame in range(last + 1)]
+    return [of_frame or [] for of_frame in in_order]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from ..system.atomic import open_atomic, write_atomic
 from ..system.extras import require
 from ..types.choices import CAMERA
 from .arguments import Commands, add_command, add_networks, chosen_models, options
-from .output import one_line, print_rows
+from .output import make_folder, one_line, print_rows
 from .run import make_perceiver
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def demo_command(arguments: argparse.Namespace) -> int:
     if arguments.camera and not arguments.model and CAMERA in shipped_models():
         arguments.model, arguments.weights = [*chosen_models(arguments), CAMERA], "default"
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
+    make_folder(arguments.out, "--out")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     image = None
     if arguments.camera:
@@ -104,7 +105,6 @@ def demo_command(arguments: argparse.Namespace) -> int:
     for k, (name, provider) in enumerate(perception.providers.items()):
         rows.append(("ran on" if k == 0 else "", f"{name}: {provider}"))
 
-    arguments.out.mkdir(parents=True, exist_ok=True)
     page, picture = arguments.out / "scene.html", arguments.out / "scene.png"
     title = "edgeperc demo: a simulated street"
     view.write_html(perception, scan.points, page, title=title)

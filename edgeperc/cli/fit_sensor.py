@@ -9,7 +9,7 @@ from pathlib import Path
 from ..errors import PointsError, SensorError
 from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_ego_box, options
-from .output import print_rows
+from .output import make_folder, print_rows
 from .scans import check_profile_place, find_scans, with_mounting
 
 _MOST_OF_PORTS = 50  # scans of a sensor that goes on sending
@@ -58,6 +58,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
         )
     check_profile_place(arguments.out)
+    make_folder(arguments.out.parent, "--out")
     scans = [
         points
         for path in files.paths
@@ -65,7 +66,6 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
     ]
     profile, functions = fit_sensor(scans, get_sensor(with_mounting(arguments.sensor, arguments)), arguments.to)
     assert profile.remission is not None
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(arguments.out, (profile.to_json() + "\n").encode())
     rows = [
         (f.kind, f"RMSE {f.rmse:.4f}; coefficients {', '.join(f'{c:.5g}' for c in f.coefficients)}") for f in functions

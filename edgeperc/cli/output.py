@@ -158,6 +158,17 @@ def lines_last(lines: Sequence[str], *, gray: bool = False) -> Iterator[None]:
             print_line(line, gray=gray and FEW in line)
 
 
+def make_folder(folder: Path, option: str) -> None:
+    """Make a folder of results. Raises OptionError, which names its option."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise OptionError(
+            f"{option}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a name that is free "
+            "in one that can be written"
+        ) from exc
+
+
 def make_places(*files: Path | None) -> None:
     """Make the folders of files that are written at the end, and refuse what cannot be one, a scan that is there, or
     a file of two options: before the work, which may take hours. Raises OptionError.
@@ -166,7 +177,7 @@ def make_places(*files: Path | None) -> None:
 
     given = [file for file in files if file is not None]
     for file in given:
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent, str(file))
         if file.is_dir():
             raise OptionError(f"{file} is a folder; expected the name of a file, which may be in it")
         if (file.suffix.lower() in SCAN_SUFFIXES and file.exists()) or given.count(file) > 1:

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import EdgepercError, ImageError, ModelError, OptionError, PointsError
+from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..records import PerceivedScan
 from ..system.extras import require
 from ..system.remote import Remote, location
@@ -31,7 +31,7 @@ from .arguments import (
     options,
     positive_number,
 )
-from .output import make_places, print_error, print_line, progress
+from .output import make_folder, make_places, print_error, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Report
 from .scans import (
@@ -194,10 +194,10 @@ def make_perceiver(
     on_mismatch: Literal["refuse", "warn", "raise", "ignore"],
     adapt: Literal["both", "remission", "interpolation", "none"] = "both",
 ) -> Perceiver:
-    """Make a perceiver with the options of the command line."""
+    """Make a perceiver with the options of the command line. ModelError for one that its models have no use for."""
     from ..perceiver import Perceiver
 
-    return Perceiver(
+    perceive = Perceiver(
         chosen_models(arguments),
         sensor=sensor,
         n_threads=arguments.threads,
@@ -206,6 +206,14 @@ def make_perceiver(
         agree=not arguments.no_agreement,
         **keywords(arguments, "provider", "precision", "score_threshold", "boxes_from", "full_turn", "trusted"),
     )
+    kinds, of_turn = {card.view.kind for card in perceive.cards}, {"range_image", "objects", "pillars"}
+    for is_given, needed, option in (
+        (arguments.full_turn, of_turn, "--full-turn needs a model of all sides"),
+        (arguments.boxes_from == "network", {"top_view", "pillars"}, "--boxes-from network needs a detector"),
+    ):
+        if is_given and not kinds & needed:
+            raise ModelError(f"{option}, and {', '.join(card.name for card in perceive.cards)} is none; leave it out")
+    return perceive
 
 
 def run_command(arguments: argparse.Namespace) -> int:
@@ -230,14 +238,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     check_outputs(arguments, kinds, images, scans, targets)
     perceivers = _Perceivers(arguments)
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
-    for folder in {target.parent for target in targets if kinds and isinstance(target, Path)}:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as exc:
-            raise OptionError(
-                f"--out {arguments.out}: the folder {folder} cannot be made ({exc.strerror}); expected a folder, or a "
-                "name that is free in one that can be written"
-            ) from exc
+    written = [*{target.parent for target in targets if kinds}, *[arguments.out] * (arguments.labels_for is not None)]
+    for folder in (folder for folder in written if isinstance(folder, Path)):
+        make_folder(folder, f"--out {arguments.out}")
+    if arguments.static is not None:
+        make_folder(arguments.static, "--static")
     gif = arguments.out / "tracks.gif" if arguments.gif else None
     make_places(arguments.mcap, arguments.rrd, arguments.play, arguments.consistency, gif)
     report = Report(arguments, images)
@@ -389,7 +394,7 @@ class _Perceivers:
 
     def check(self, scans: Sequence[Path | Remote], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
-        arguments, of_turn = self._arguments, {"range_image", "objects", "pillars"}
+        arguments = self._arguments
         self._sensors = Sensors(arguments, scans)
         scans = [scan for scan in scans if isinstance(scan, Path)]
         for scan in scans:
@@ -413,12 +418,6 @@ class _Perceivers:
             )
         if of_images and not scans and kinds != {"camera"}:
             raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
-        for is_given, needed, option in (
-            (arguments.full_turn, of_turn, "--full-turn needs a model of all sides"),
-            (arguments.boxes_from == "network", {"top_view", "pillars"}, "--boxes-from network needs a detector"),
-        ):
-            if is_given and not kinds & needed:
-                raise ModelError(f"{option}, and {', '.join(c.name for c in cards)} is none; leave it out")
 
     def sensor_of(self, path: Path | Remote, url: Remote | None = None) -> str | SensorProfile:
         """The sensor of ``--sensor``, of the capture, or the one that is found in the points."""

@@ -106,8 +106,11 @@ def test_a_folder_that_cannot_be_made_is_named_with_its_option(
     out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scan = write_scan(tmp_path / "a.bin")
-    assert run("run", scan, "--labels", "--out", tmp_path / out) == 2
-    assert f"--out {tmp_path / out}: the folder {tmp_path / out} cannot be made" in capsys.readouterr().err
+    for option in ("--labels", "--labels-for=kitti"):
+        assert run("run", scan, option, "--out", tmp_path / out) == 2
+        assert f"--out {tmp_path / out}: the folder {tmp_path / out} cannot be made" in capsys.readouterr().err
+    assert run("demo", "--out", tmp_path / out) == run("run", scan, "--movable", "--static", tmp_path / out) == 2
+    assert capsys.readouterr().err.count(f"the folder {tmp_path / out} cannot be made") == 2
 
 
 @pytest.mark.parametrize(
@@ -122,3 +125,4 @@ def test_options_of_another_model_are_refused(
 ) -> None:
     arguments = ("--model", model, "--provider", "cpu", *options.split())
     assert said in shell.err("run", write_scan(tmp_path / "a.bin"), *arguments)
+    assert said in shell.err("demo", *arguments)

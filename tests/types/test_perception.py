@@ -202,8 +202,11 @@ def test_boxes_are_of_the_frames_that_their_scans_name(tmp_path: Path) -> None:
     assert read("0000/000001.bin", "0000/000000.pcd.bin", "drive.pcap/000002") == [2, 1, 3]
     assert read("a.bin", "1533151603547590.bin") == [1, 2]  # times are no frames
     assert read("77.bin", "12.bin", frames={"12": 0, "77": 1}) == [2, 1]
-    with pytest.warns(UserWarning, match="no line for 1 of 3 frames, such as 1"):
+    with pytest.warns(UserWarning, match="no line with boxes for 1 of 3 frames, such as 1"):
         assert read("0.bin", "2.bin") == [1, 0, 2]
+    path.write_text(path.read_text() + '\n{"scan": "3.bin", "error": "the file is empty"}')  # of a scan that failed
+    with pytest.warns(UserWarning, match="for 2 of 4 frames, such as 1"):
+        assert [*map(len, read_boxes(path))] == [1, 0, 2, 0]
     with pytest.raises(TrackingError, match=r"b/0\.bin has the frame of a/0\.bin, 0"):
         read("a/0.bin", "b/0.bin")
     with pytest.raises(TrackingError, match=r"7\.bin is none of the sequence"):
