@@ -63,9 +63,10 @@ class PrelabelSink:
     With tracks, these are the tracks with their ids, smoothed when the drive is over (`edgeperc.smooth_tracks`), from
     the first to the last scan that an object was detected in; nothing is written of a drive that does not end. Those of
     a live source are written at once, where they were detected. Without tracks, and of late scans, these are the boxes
-    of the perception. Boxes are where the scan's file has its points: in the frame of the scan, or in its map, if its
-    place there is known (``origin_m``); KITTI's are in the frame of the camera, where ``calib/NAME.txt`` puts
-    these points. A scan without boxes gets an empty file. Labels that are there and differ stay: perhaps the truth.
+    of the perception. Boxes are where ``scan.points`` are, of a straightened scan not where its file has them: in the
+    frame of the scan, or in its map, if its place there is known (``origin_m``); KITTI's are in the frame of the
+    camera, where ``calib/NAME.txt`` puts these points. A scan without boxes gets an empty file. Labels that are there
+    and differ stay: perhaps the truth.
 
     - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
     - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
@@ -132,11 +133,10 @@ class PrelabelSink:
             tracked = None if scan.tracked is None else [track for track in scan.tracked if not track.coasting]
             self._write_boxes(item, tracked)
             return
-        former: list[tuple[_Item, Tracks]] = []
-        if self._drive and scan.tracks.session != self._drive[-1][1].session:
-            former, self._drive = self._drive, []
         self._drive.append((item, scan.tracks))
-        if former:
+        # Of one session alone, the last scan may have a wrong stamp: the next one then goes on with the session before.
+        if self._drive[0][1].session not in [tracks.session for _, tracks in self._drive[-2:]]:
+            former, self._drive = self._drive[:-2], self._drive[-2:]
             self._write_drive(former)
 
     def _write_drive(self, drive: Sequence[tuple[_Item, Tracks]]) -> None:
@@ -217,11 +217,7 @@ class PrelabelSink:
             {
                 "obj_id": "" if number is None else str(number),
                 "obj_type": _SUSTECH_CLASSES.get(box.label, _capital(box.label)),
-                "psr": {
-                    "position": _named("xyz", box.center),
-                    "rotation": _named("xyz", (0.0, 0.0, wrapped(box.yaw))),
-                    "scale": _named("xyz", box.size),
-                },
+                "psr": {part: _named("xyz", values) for part, values in cvat_cuboid(box).items()},
             }
             for box, number in boxes
         ]
@@ -237,16 +233,8 @@ class PrelabelSink:
             attributes: dict[str, Any] = {"occluded": False}
             if number is not None:
                 attributes |= {"track_id": number, "keyframe": True, "outside": outside}
-            annotations.append(
-                {
-                    "id": k,
-                    "type": "cuboid_3d",
-                    "attributes": attributes,
-                    "group": 0,
-                    "label_id": self._number(box.label),
-                    **cvat_cuboid(box),
-                }
-            )
+            named = {"attributes": attributes, "group": 0, "label_id": self._number(box.label)}
+            annotations.append({"id": k, "type": "cuboid_3d", **named, **cvat_cuboid(box)})
         item = {"id": name, "annotations": annotations, "attr": {"frame": self._n_items}}
         self._document.write((", " if self._n_items else "").encode() + json.dumps(item).encode())
         self._n_items += 1
