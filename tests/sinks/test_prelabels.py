@@ -264,8 +264,8 @@ def test_tracks_keep_their_ids_and_end(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:got a scan at:UserWarning")
 def test_labels_of_a_drive_come_when_it_is_over(tmp_path: Path) -> None:
-    """Smoothed, and where a car was not detected for a scan, too; those of a live source come at once. Scan 5, of a wrong
-    stamp, is no end.
+    """Smoothed, and where a car was not detected for a scan, too; those of a live source come at once. Scan 5 has a
+    wrong stamp, and is no end.
     """
     tracker, sink, ahead = Tracker(), PrelabelSink(tmp_path, "sustechpoints"), (box("car", 12.0, 0.0, 0.0),)
     places = [tmp_path / f"label/{k:06d}.json" for k in range(11)]
