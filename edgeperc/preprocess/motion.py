@@ -406,12 +406,13 @@ def merge(
 
 def _rows(content: bytes) -> Floats:
     """The numbers in a file of poses, (n, 8); ValueError says what else it holds."""
-    first = next((line for line in content.splitlines() if line.partition(b"#")[0].strip()), b"")
+    text = content[:MAX_BYTES].decode("latin-1")
+    first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
     if not first:
         raise ValueError("no line of numbers")
-    if b"," in first:
+    if "," in first:
         raise ValueError("its values are separated by commas, as EuRoC's, whose times are nanoseconds")
-    rows = np.loadtxt(io.BytesIO(content[:MAX_BYTES]), np.float64, ndmin=2, encoding="latin-1")
+    rows = np.loadtxt(io.StringIO(text), np.float64, ndmin=2)
     if len(content) > MAX_BYTES or rows.shape[1] != 8:
         kind = ", as KITTI's poses, which have no times" if rows.shape[1] == 12 else ""
         raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line{kind}")

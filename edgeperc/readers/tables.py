@@ -124,13 +124,12 @@ def parse_table(
     n_there = n if skipped_rows + n <= len(ends) else n_ended - skipped_rows
     if n_there < 1 or n * _LEAST_ROW_BYTES > MAX_SCAN_BYTES:
         raise PointsError(f"cut short: {skipped_rows + n} rows declared, {len(ends)} are there")
-    text = body[ends[skipped_rows - 1] if skipped_rows else 0 : ends[skipped_rows + n_there - 1]].tobytes()
-    if not text.strip():
+    raw = body[ends[skipped_rows - 1] if skipped_rows else 0 : ends[skipped_rows + n_there - 1]].tobytes()
+    text = raw.decode("latin-1")
+    if not text.strip():  # of what numpy takes for blanks, too, such as the separators of ASCII
         raise PointsError(f"cut short: {n} rows declared, none are there")
     try:
-        rows = np.loadtxt(
-            io.BytesIO(text), np.float64, comments=None, usecols=list(wanted.values()), ndmin=2, encoding="latin-1"
-        )
+        rows = np.loadtxt(io.StringIO(text), np.float64, comments=None, usecols=list(wanted.values()), ndmin=2)
     except (ValueError, OverflowError) as exc:
         raise PointsError(f"a row of text does not hold numbers: {exc}") from exc
     if len(rows) != n_there:

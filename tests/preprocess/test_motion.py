@@ -202,6 +202,7 @@ def test_poses_of_another_time_are_refused(first_s: float, last_s: float) -> Non
     [
         ("", "cannot be read as poses|2 or more|two or more"),
         ("# only a comment\n", "no line of numbers"),
+        ("\x1c\n", "no line of numbers"),
         ("no numbers", "cannot be read as poses"),
         ("#timestamp, p_x\n1403636580838555648,4.6,-1.7,0.7,0.5,-0.1,-0.8,-0.1\n", "commas, as EuRoC's"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "12 numbers in a line, as KITTI's poses, which have no times"),

@@ -296,6 +296,7 @@ BAD_FILES = {
     "text.pcd": (pcd(*XYZ, 1, "ascii", b"1 two 3\n"), "row"),
     "ragged.pcd": (pcd(*XYZ, 2, "ascii", b"1 2 3\n1 2\n"), "row"),
     "blank.pcd": (pcd(*XYZ, 2, "ascii", b"\n\n\n"), "none are there"),
+    "separators.pcd": (pcd(*XYZ, 2, "ascii", b"\x1c\n\x1f\n"), "none are there"),
     "disagree.pcd": (pcd(*XYZ, 2, "ascii", b"1 2 3\n", width=3), "must agree"),
     "declared.pcd": (pcd(*XYZ, 1 << 60, "binary", b"\0" * 24), "cut short"),
     "declared_ascii.pcd": (pcd(*XYZ, 1 << 60, "ascii", b"1 2 3\n"), "cut short"),
