@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cli_helpers import POINTSEG, Shell
 from edgeperc import Box, OptionError, Perception, PointsError, Tracker
+from edgeperc.cli.evaluation.unlabeled import ConsistencySink
 from edgeperc.evaluation.consistency import Consistency
 from edgeperc.types.frame import moved_boxes
 from edgeperc.types.sensor import get_sensor
@@ -153,3 +154,7 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.
     for options in ([], ["--track", "--live"]):
         refused = "--consistency needs --track, and no --live"
         assert refused in shell.err("run", drive, *options, "--consistency", file)
+    sink = ConsistencySink(tmp_path / "stopped.json")
+    with pytest.warns(RuntimeWarning, match="stopped.json"):
+        sink.close(whole=False)
+    assert json.loads((tmp_path / "stopped.json.part").read_text())["n_scans"] == 0
