@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats32, Ints64
-from .packets import LVX_MAGIC
+from .packets import LVX_MAGIC, Newest
 from .times import TimedScan
 
 SCAN_S = 0.1  # the sensors turn or sweep ten times a second
@@ -125,13 +125,14 @@ class LivoxStream:
 
     def __init__(self) -> None:
         self._packets: list[Points] = []
+        self._newest = Newest()
 
     def add(self, packet: Points) -> Iterator[TimedScan]:
-        """The scan that ends before a packet."""
-        if self._packets:
-            begin_s = self._packets[0].time_s
-            if not begin_s <= packet.time_s < begin_s + SCAN_S - 1e-6 or packet.kind != self._packets[0].kind:
-                yield from self.end()
+        """The scan that ends before a packet; one that comes late is of the scan that it comes in."""
+        first, is_late = self._packets[0] if self._packets else packet, self._newest.has_overtaken(packet.time_s)
+        is_of_scan = is_late or first.time_s <= packet.time_s < first.time_s + SCAN_S - 1e-6
+        if not is_of_scan or packet.kind != first.kind:
+            yield from self.end()
         self._packets.append(packet)
 
     def end(self) -> Iterator[TimedScan]:
@@ -152,7 +153,7 @@ class LivoxStream:
         times_s = np.repeat(starts_s, n_points) + rank * np.repeat(durations_s * kind.returns / n_points, n_points)
         points, which = np.empty((len(rank), 4), np.float32), np.empty(len(rank), np.int64)
         n = fill_points(content, kind.stride, kind.layout, points, which)
-        yield TimedScan(float(times_s[-1]), points[:n].copy(), times_s[which[:n]])
+        yield TimedScan(float(times_s.max()), points[:n].copy(), times_s[which[:n]])
 
 
 def lvx2_sensors(path: Path) -> list[str]:

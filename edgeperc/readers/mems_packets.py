@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types.points import Floats
+from .packets import Newest
 from .times import TimedScan
 
 _MAGIC = bytes.fromhex("55aa5aa5")
 _UNIT_M = 0.005
-_LATE = 10  # packets that may overtake one
 _MOST_PACKETS = 10_000  # of a frame; an M1 has 1,260 with two returns
 
 _ANGLES = [("distance", ">u2"), ("pitch", ">u2"), ("yaw", ">u2"), ("reflectivity", "u1"), ("more", "V2")]
@@ -69,12 +69,15 @@ class MemsStream:
     """Frames from packets of one format."""
 
     def __init__(self, row: MemsFormat) -> None:
-        self._row, self._packets, self._last = row, list[bytes](), -1
+        self._row, self._packets, self._last, self._newest = row, list[bytes](), -1, Newest()
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
-        """The frame that ends before a packet: where packets are counted anew."""
+        """The frame that ends before a packet: where packets are counted anew. A late one is of that it comes in."""
         number = int.from_bytes(payload[4:6], "big")
-        if number + _LATE < self._last or len(self._packets) >= _MOST_PACKETS:
+        now_s = int.from_bytes(payload[10:16], "big") + 1e-6 * int.from_bytes(payload[16:20], "big")
+        if self._newest.has_overtaken(now_s):
+            number = self._last
+        if number < self._last or len(self._packets) >= _MOST_PACKETS:
             yield from self.end()
         self._last = max(self._last, number)
         self._packets.append(bytes(payload))

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import PointsError
 from ..types.points import Floats, Ints64
+from .packets import Newest
 from .spinning_packets import Format, time_of
 from .times import TimedScan
 
@@ -80,11 +81,11 @@ class MirrorStream:
     def __init__(self, row: Format, mirrors: Mirrors) -> None:
         self._row, self._mirrors = row, mirrors
         self._off = np.moveaxis(mirrors.off, 2, 0).copy()
-        self._packets, self._mirror, self._size = list[_Packet](), -1, 0
+        self._packets, self._mirror, self._size, self._newest = list[_Packet](), -1, 0, Newest()
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
         """The frames that end in a packet of the format: where another mirror begins. All have the size of the first;
-        others are left out.
+        others are left out, and what comes late of a mirror before.
         """
         self._size = self._size or len(payload)
         if len(payload) != self._size:
@@ -92,16 +93,15 @@ class MirrorStream:
         row, mirrors = self._row, self._mirrors
         angles = (_MOTOR.unpack_from(payload, at) for at in row.blocks_at)
         motor = [256 * hundredths + fine for hundredths, fine in angles]
-        seen = [mirrors.at(angle) for angle in motor]
+        seen, time_s = [mirrors.at(angle) for angle in motor], time_of(row, payload)
+        is_late = self._newest.has_overtaken(time_s)
         for mirror in dict.fromkeys(seen):
-            if mirror < 0:
+            if mirror < 0 or (is_late and mirror != self._mirror):
                 continue
             if mirror != self._mirror or len(self._packets) >= _MOST_PACKETS:
                 yield from self.end()
             self._mirror = mirror
-            self._packets.append(
-                _Packet(bytes(payload), time_of(row, payload), motor, [each == mirror for each in seen])
-            )
+            self._packets.append(_Packet(bytes(payload), time_s, motor, [each == mirror for each in seen]))
 
     def end(self) -> Iterator[TimedScan]:
         """The last frame, which may be a part."""

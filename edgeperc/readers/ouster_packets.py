@@ -125,10 +125,11 @@ def layout_of(content: Any) -> Layout:
     packet_bytes = 2 * header + per_packet * column_bytes
     if packet_bytes > _MOST_PACKET_BYTES:
         raise PointsError(f"packets of {packet_bytes:,} bytes; expected at most {_MOST_PACKET_BYTES:,}")
+    name = str(info.get("prod_sn") or 0)
     n_motions = int(_number(object_in(content, "imu_data_format"), "imu_measurements_per_packet", 8))
     return Layout(
-        name=str(info.get("prod_sn") or 0),
-        serial=0 if is_legacy else _digits(info.get("prod_sn")),
+        name=name,
+        serial=0 if is_legacy or not re.fullmatch(r"\d{1,18}", name) else int(name),
         init_id=0 if is_legacy else int(_number(info, "initialization_id", 0)),
         port=int(_number(config, "udp_port_lidar", 0)),
         fields=fields,
@@ -144,10 +145,6 @@ def layout_of(content: Any) -> Layout:
         to_lidar=_transform(beams, "beam_to_lidar_transform", to_beam),
         to_sensor=_transform(lidar, "lidar_to_sensor_transform", np.reshape(_LIDAR_TO_SENSOR, (4, 4))),
     )
-
-
-def _digits(value: Any) -> int:
-    return int(value) if isinstance(value, str | int) and re.fullmatch(r"\d{1,18}", str(value)) else 0
 
 
 def _number(content: Mapping[str, Any], name: str, default: float) -> float:
@@ -263,8 +260,10 @@ class OusterStream:
             yield self._finished()
 
     def _later(self, turn: int, other: int) -> int:
-        """How many turns the one comes after the other; they are counted in 16 or 32 bits."""
-        return (turn - other + self._ids // 2) % self._ids - self._ids // 2
+        """How many turns the one comes after the other; they are counted in 16 or 32 bits, and anew by a sensor that
+        starts: what seems to come much too late is new.
+        """
+        return (turn - other + _MOST_AHEAD) % self._ids - _MOST_AHEAD
 
     def _finished(self) -> TimedScan:
         table = np.frombuffer(b"".join(self._packets), np.uint8).reshape(len(self._packets), -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import ipaddress
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -103,15 +104,17 @@ class Datagrams:
         self._pending: dict[bytes, list[memoryview]] = {}  # by source: fragments so far
 
     def __iter__(self) -> Iterator[Datagram]:
+        before: tuple[memoryview | str | int, ...] = ()
         if is_port(self._path):
             listener = listen(self._path)
             for datagram in listener.run(self._alive) if self._endless else listener.first(self._alive):
                 if self.n_packets % 10_000 == 0:
                     self._alive()
                 self.n_packets += 1
-                yield datagram
+                if (datagram.payload, datagram.sender, datagram.port) != before:
+                    yield datagram
+                before = datagram.payload, datagram.sender, datagram.port
             return
-        before: tuple[memoryview, ...] = ()
         try:
             for link, stamp_s, packet in islice(pcap_packets(self._path), self._most):
                 if self.n_packets % 10_000 == 0:
@@ -189,6 +192,18 @@ def velodyne_captured(
             yield datagram.stamp_s, datagram.payload
     if not are_sent:
         yield from _bare_velodyne_packets(path)
+
+
+class Newest:
+    """Tells packets that others have overtaken, by the sensor's clock: they begin no scan."""
+
+    _s = -math.inf
+
+    def has_overtaken(self, now_s: float) -> bool:
+        """Whether a packet of this time is late; a clock that goes back farther was set."""
+        is_late = 0.0 < self._s - now_s < _OVERTAKEN_S
+        self._s = self._s if is_late else now_s
+        return is_late
 
 
 def _turned_s(datagram: Datagram, before_s: float) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints64, Points
-from .packets import DIFOP
+from .packets import DIFOP, Newest
 from .times import TimedScan
 
 
@@ -350,19 +350,19 @@ class SpinningStream:
         self._row, self._angles = row, angles
         self._order: Literal["<", ">"] = "<" if row.is_hesai else ">"
         self._packets: list[_Packet] = []
-        self._last_deg, self._size = np.nan, 0
+        self._last_deg, self._size, self._newest = np.nan, 0, Newest()
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
         """The turns that end in a packet of the format: where the azimuth begins anew. All have the size of the first;
-        others are left out.
+        others are left out. One that comes late is of the turn that it comes in.
         """
         self._size = self._size or len(payload)
         if len(payload) != self._size:
             return
         packet = self._packet(payload)
-        begin = 0
+        begin, is_late = 0, self._newest.has_overtaken(packet.time_s)
         for k, azimuth in enumerate(packet.azimuths.tolist()):
-            if azimuth != azimuth:
+            if is_late or azimuth != azimuth:
                 continue
             if abs(azimuth - self._last_deg) > _HALF_TURN_DEG:
                 yield from self._turn(packet, begin, k)

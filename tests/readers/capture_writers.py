@@ -62,6 +62,15 @@ def records_of(content: bytes) -> list[bytes]:
     return found
 
 
+def let_overtake(path: Path, first: int = 1) -> Path:
+    """Every second packet of a capture comes behind the next one."""
+    records = records_of(content := path.read_bytes())
+    for k in range(first, len(records) - 1, 2):
+        records[k : k + 2] = records[k + 1], records[k]
+    path.write_bytes(content[:24] + b"".join(records))
+    return path
+
+
 def in_ip(payload: bytes, k: int = 0, sender: str = "192.168.1.201") -> bytes:
     """The k-th datagram of UDP of a sender, ``ADDRESS[:PORT]``, in IPv4."""
     address, _, port = sender.partition(":")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_writers import check_same, sized, write_pcap
+from capture_writers import check_same, let_overtake, sized, write_pcap
 from hypothesis import given
 from hypothesis import strategies as st
 from lidar_writers import T0_S, mems_packets
@@ -72,6 +72,7 @@ def test_what_is_written_is_read(tmp_path: Path, name: str) -> None:
     assert check_same(read_timed_scans(bag), scans, clock=False) == 3
     for source in (path, bag):
         assert sensor_of(source) is SENSORS[f"rs-{name}"]
+    assert sum(len(scan.points) for scan in [*read_timed_scans(let_overtake(path))][:3]) == len(whole)
 
 
 @pytest.mark.parametrize("name", PER_PACKET)

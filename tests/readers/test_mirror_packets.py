@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_writers import check_same, write_pcap
+from capture_writers import check_same, let_overtake, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import T0_S, at128_correction, at128_packets
@@ -91,6 +91,7 @@ def test_what_is_written_is_read(tmp_path: Path, numbered: bool) -> None:
     assert check_same(read_timed_scans(bag), scans, clock=False) == 4
     for source in (path, bag):
         assert sensor_of(source) is SENSORS["at128"]
+    assert len([*read_timed_scans(let_overtake(path, 0))]) == 4
 
 
 def test_of_two_returns_both_are_points_unless_they_are_equal(tmp_path: Path) -> None:

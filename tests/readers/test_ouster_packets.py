@@ -146,13 +146,14 @@ def test_fields_of_every_profile_are_ousters() -> None:
 def test_lost_late_and_doubled_packets(tmp_path: Path, seed: int) -> None:
     """Packets may come one or two places late; a turn with lost ones ends when four of the next have come."""
     rng = np.random.default_rng(seed)
-    packets = [p for turn in random_packets(METADATA, 5, seed) for p in turn]
+    packets = [p for turn in random_packets(METADATA, 6, seed) for p in turn]
     order = np.argsort(np.arange(len(packets)) + rng.integers(0, 3, len(packets)), kind="stable")
     kept = [packets[k] for k in order if rng.random() < 0.9 for _ in range(1 + (rng.random() < 0.05))]
     if seed % 2:
         kept += packets[-6:-3]
     path = record(tmp_path, METADATA, kept)
     assert_same(path, path.with_suffix(".json"))
+    assert len(list(read_timed_scans(record(tmp_path, METADATA, packets * 2)))) == 12
 
 
 def test_other_windows_and_headers(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_writers import check_same, vlp16_packets, write_link, write_pcap
+from capture_writers import check_same, let_overtake, vlp16_packets, write_link, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, T0_S, Model, blocks_of, calibration, difop, expected, packets_of, ranges, unit_angles
@@ -95,6 +95,9 @@ def test_turns_begin_where_the_azimuth_does(tmp_path: Path, name: str) -> None:
     for scan, begin, end in zip(scans, ends[:-1], ends[1:], strict=True):
         assert len(scan.points) == sum(int((units > 0).sum()) for _, units, _ in blocks[begin:end])
     assert [scan.stamp_s for scan in scans] == sorted(scan.stamp_s for scan in scans)  # type: ignore[type-var]
+    for first in (0, 1):
+        assert len(late := [scan.points for scan in read_timed_scans(let_overtake(path, first))]) == 3
+        assert sum(map(len, late)) == sum(len(scan.points) for scan in scans)
 
 
 def test_times_go_on_within_a_packet(tmp_path: Path) -> None:
