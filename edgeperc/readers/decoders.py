@@ -51,6 +51,7 @@ from .times import TimedScan, of_plausible_duration, point_times
 
 _Item = TypeVar("_Item")
 _DESCRIBED = 200  # packets that show how far apart the columns of a turn are
+_OTHERS_AT_PORT = 500  # packets of other Ousters, half a second and more, before one that the metadata is of
 _FEWEST_ALIKE = 16  # packets of another Ouster; damaged ones are each unlike
 _READERS: Mapping[tuple[str, str], Callable[[memoryview], Cloud | Packets]] = {**CLOUD_READERS, **PACKET_READERS}
 
@@ -171,8 +172,16 @@ def _packet_scans(kind: str, job: _Job) -> Iterator[TimedScan]:
         yield from lvx2_scans(job.path, _choose("LiDAR", lvx2_sensors(job.path), job.topic), job.alive)
     else:
         yield from _pcap_scans(job)
+        is_told = False
         while is_port(job.path):
-            yield from _pcap_scans(job)
+            try:
+                yield from _pcap_scans(job)
+                is_told = False
+            except PointsError as exc:  # of a sensor that starts, or of another program
+                listen(job.path).begun = []
+                if not is_told:
+                    job.say(f"no scans for now, and edgeperc waits: {exc}")
+                is_told = True
 
 
 def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
@@ -190,7 +199,7 @@ def _pcap_scans(job: _Job) -> Iterator[TimedScan]:
     n_scans = 0
     for scan in _chosen_reader(job, senders, is_velodyne):
         n_scans += 1
-        if listener is None or (n_scans > 1 and listener.is_running):  # others are parts of a turn
+        if listener is None or (n_scans > 1 and listener.begun):  # others are parts of a turn
             yield scan
     if listener is not None:  # the next run of its packets may be another sensor's
         return
@@ -226,7 +235,8 @@ def _chosen_reader(job: _Job, senders: Senders, is_velodyne: bool) -> Iterator[T
     read = readers[0][1] if len(known) < 2 else next(read for names, read in reversed(readers) if chosen in names)
     if read is not readers[-1][1]:
         _check_unnamed(job.remission_field)
-    return read(chosen if len(known) > 1 else None)
+    # Of a file with one sensor, packets with a damaged address are its own, too; at a port, another one may begin.
+    return read(chosen if len(known) > 1 else known[0] if known and is_port(job.path) else None)
 
 
 def _check_unnamed(remission_field: str | None) -> None:
@@ -277,6 +287,8 @@ def _ouster_turns(job: _Job) -> Iterator[TimedScan]:
             continue
         if not stream.is_of_sensor(datagram.payload) or (len(layouts) > 1 and chosen.port not in (0, datagram.port)):
             others[stream.numbers_of(datagram.payload)] += 1
+            if is_port(job.path) and not n_used and others.total() == _OTHERS_AT_PORT:
+                break
             continue
         if not (chosen.serial or chosen.init_id):  # the packets of old firmware do not say whose they are
             senders[datagram.sender, datagram.port] += 1

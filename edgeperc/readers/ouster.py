@@ -35,7 +35,7 @@ def metadata_beside(path: Path) -> list[Path]:
         if files := [file for file in alike[n] if not _is_profile(file)]:
             return files
     raise PointsError(
-        "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
+        "no points of a LiDAR that is known (one that starts sends none), unless they are an Ouster's: there is no "
         "metadata next to it. Expected a .json file whose name has the same beginning"
     )
 

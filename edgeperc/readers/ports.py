@@ -76,9 +76,9 @@ class Listener:
         ports = [*map(int, match[2].split(","))] if match else []
         if not ports or not all(0 < port < 65_536 for port in ports):
             raise PointsError("expected ports as udp:2368, udp:6699,7788 or udp:ADDRESS:2368")
-        self._first, self._is_new = list[Datagram](), True
+        self.begun = list[Datagram]()  # the first packets of the run that goes on
         self._waiting, self._changed = deque[Datagram](), threading.Condition()
-        self._is_late, self._closed = False, threading.Event()
+        self._is_new, self._is_late, self._closed = True, False, threading.Event()
         self._sockets: list[socket.socket] = []
         for port in ports:
             try:
@@ -100,38 +100,33 @@ class Listener:
     def first(self, alive: Callable[[], None]) -> list[Datagram]:
         """The first packets of this run."""
         begun_s = time.monotonic()
-        while not self._first:
+        while not self.begun:
             if self._closed.is_set():
-                raise PointsError("the ports were closed")
+                raise OSError("the ports were closed")
             self._is_late = False
             alive()
-            datagram = self._next(SILENCE_S)
+            datagram = self.take(SILENCE_S)
             if datagram is not None:
                 self._is_new, end_s = False, time.monotonic() + FIRST_S
                 while datagram is not None:
-                    self._first.append(datagram)
+                    self.begun.append(datagram)
                     left_s = end_s - time.monotonic()
-                    datagram = self._next(left_s) if left_s > 0.0 else None
+                    datagram = self.take(left_s) if left_s > 0.0 else None
             elif self._is_new and time.monotonic() - begun_s > PATIENCE_S:
                 raise PointsError(
                     f"no packet came in {PATIENCE_S:g} s. Let the sensor send to an address of this "
                     "computer and to this port, and the firewall pass UDP; tcpdump -i any udp shows what comes"
                 )
-        return self._first
-
-    @property
-    def is_running(self) -> bool:
-        """Whether packets of this run may come."""
-        return bool(self._first)
+        return self.begun
 
     def run(self, alive: Callable[[], None]) -> Iterator[Datagram]:
         """All packets of this run; the next call has those of the next one."""
         yield from self.first(alive)
-        while (datagram := self._next(SILENCE_S)) is not None:
+        while (datagram := self.take(SILENCE_S)) is not None:
             yield datagram
-        self._first, self._is_late = [], False
+        self.begun, self._is_late = [], False
 
-    def _next(self, wait_s: float) -> Datagram | None:
+    def take(self, wait_s: float) -> Datagram | None:
         """The next packet; None if none comes in time, or if some were dropped in this run."""
         with self._changed:
             is_there = self._changed.wait_for(lambda: self._waiting, max(wait_s, 0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,3 +40,19 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(captures, "decode_apart", decoded)
     monkeypatch.setattr(captures, "describe_apart", described)
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.fixture
+def source(port: int) -> Iterator[Path]:
+    """The ports, which this process listens to no more after the test."""
+    from edgeperc.readers import ports
+
+    yield (path := Path(f"udp:{port}"))
+    ports.release(path)

@@ -457,8 +457,8 @@ def test_damaged_osf_is_refused_before_the_sdk_opens_it(ouster: Path, tmp_path: 
 
 def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> None:
     path = write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7)
-    assert "not a Velodyne capture" in error_of(path)
-    with pytest.raises(PointsError, match=r"other\.pcap: not a Velodyne capture"):
+    assert "no points of a LiDAR" in error_of(path)
+    with pytest.raises(PointsError, match=r"other\.pcap: no points of a LiDAR"):
         edgeperc.sensor_of(path)
     path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
     assert "has 7 packets, none from a supported LiDAR" in error_of(path)
@@ -468,7 +468,7 @@ def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> No
     ("name", "content", "error"),
     [
         ("empty.pcap", b"", "cut short: 0 bytes"),
-        ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "not a Velodyne capture"),
+        ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "no points of a LiDAR"),
         ("half.pcap", b"\xd4\xc3\xb2\xa1\x02\0\x04\0", "cut short: 8 bytes"),
         ("text.pcap", b"no capture at all, but text", "not a pcap file by its first bytes"),
         ("new.pcapng", b"\n\r\r\n" + bytes(40), "cut short or damaged: a section does not say its byte order"),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Iterator, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from capture_writers import (
     LINKS,
@@ -26,7 +28,7 @@ from test_captures import error_of
 from test_captures import ouster as ouster
 
 from edgeperc import PointsError
-from edgeperc.readers import packets
+from edgeperc.readers import packets, ports
 from edgeperc.readers.captures import read_scans, sensor_of
 from edgeperc.readers.pcap import pcap_packets
 from edgeperc.readers.senders import Senders
@@ -220,3 +222,15 @@ def test_packets_behind_a_step_of_the_clock_stay_behind() -> None:
     assert list(packets.in_order(sent)) == sent
     gps = packets.Datagram("10.0.0.1", 8308, 0.5, memoryview(bytes(512)))
     assert sorted(packets.in_order([*sent[:3], gps]), key=lambda each: each.stamp_s) == [gps, *sent[:3]]
+
+
+def test_neither_another_sensor_nor_what_is_none_disturbs(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Velodyne that begins later at the port; packets of other programs after a silence; packets that come twice."""
+    monkeypatch.setattr(ports, "FIRST_S", 0.0)
+    own, other = ([ports.Datagram(f"{m}", 1, 0.0, memoryview(b)) for b in vlp16_packets(4.0, m)] for m in (8, 9))
+    junk = own[0]._replace(payload=memoryview(bytes(700)))
+    came = chain(*zip(own, own, other, strict=True), [None, junk, junk, None], own, [None])
+    monkeypatch.setattr(ports.listen(source), "take", lambda _: next(came))
+    with pytest.warns(UserWarning, match="no scans for now, and edgeperc waits: no points of a LiDAR that is") as said:
+        away = [np.linalg.norm(points[:, :3], axis=1).round() for _, points in islice(read_scans(source), 4)]
+    assert (len(said), [(len(each), each.max()) for each in away]) == (1, [(28_800, 8.0)] * 4)

@@ -6,7 +6,9 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from itertools import cycle, islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -14,55 +16,27 @@ import pytest
 from capture_writers import write_pcap
 from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
 
-from cli_helpers import Shell
 from edgeperc import PointsError, read_timed_scans, sensor_of, stream
 from edgeperc.readers import ports
 from edgeperc.readers.packets import Datagrams
 
-Sender = Callable[[Sequence[bytes]], None]
+Sender = Callable[[Sequence[bytes]], object]
 MODEL = MODELS["pandar40p"]
-PER_TURN = 1800
-
-
-@pytest.fixture
-def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("", 0))
-        return int(one.getsockname()[1])
 
 
 @pytest.fixture
 def send(port: int) -> Iterator[Sender]:
     """Sends packets again and again, 2,000 a second."""
-    over, threads = threading.Event(), list[threading.Thread]()
+    over = threading.Event()
 
     def run(packets: Sequence[bytes]) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-            while not over.is_set():
-                for packet in packets:
-                    one.sendto(packet, ("127.0.0.1", port))
-                    over.wait(0.0005)
+            for packet in takewhile(lambda _: not over.wait(0.0005), cycle(packets)):
+                one.sendto(packet, ("127.0.0.1", port))
 
-    def begin(packets: Sequence[bytes]) -> None:
-        threads.append(threading.Thread(target=run, args=(packets,)))
-        threads[-1].start()
-
-    yield begin
-    over.set()
-    for thread in threads:
-        thread.join()
-
-
-@pytest.fixture
-def source(port: int) -> Iterator[Path]:
-    """The ports, which this process listens to no more after the test."""
-    yield (path := Path(f"udp:{port}"))
-    ports.release(path)
-
-
-def packets() -> list[bytes]:
-    """Two turns."""
-    return packets_of(MODEL, blocks_of(MODEL, *ranges(MODEL, 2 * PER_TURN)))
+    with ThreadPoolExecutor() as pool:
+        yield lambda packets: pool.submit(run, packets)
+        over.set()
 
 
 def silent() -> None:
@@ -76,30 +50,23 @@ def test_turns_at_a_port_are_those_of_a_capture(
     monkeypatch.chdir(tmp_path)
     for name in ("drive", port):
         Path(f"{name}.csv").write_text(calibration(unit_angles(MODEL)))
-    sent = packets()
+    sent = packets_of(MODEL, blocks_of(MODEL, *ranges(MODEL, 3600)))
     of_capture = [*read_timed_scans(write_pcap(tmp_path / "drive.pcap", sent))]
     send(sent)
-    sensor = sensor_of(f"udp:{port}")
-    assert sensor is not None
-    assert sensor == sensor_of(tmp_path / "drive.pcap")
-    whole = list[np.ndarray]()
+    assert sensor_of(f"udp:{port}") == sensor_of(tmp_path / "drive.pcap") is not None
     with closing(read_timed_scans(f"udp://127.0.0.1:{port}")) as scans:  # type: ignore[type-var]
-        for scan in scans:
-            whole += [scan.points] * any(np.array_equal(scan.points, each.points) for each in of_capture)
-            if len(whole) == 4:
-                break
-    assert not np.array_equal(whole[0], whole[1])
+        whole = (s.points for s in scans if any(np.array_equal(s.points, each.points) for each in of_capture))
+        first, second, *_ = islice(whole, 4)
+    assert not np.array_equal(first, second)
 
 
 def test_where_the_angles_come_is_said(port: int, send: Sender) -> None:
     model = MODELS["rs-32"]
-    send(packets_of(model, blocks_of(model, *ranges(model, PER_TURN))))
+    send(packets_of(model, blocks_of(model, *ranges(model, 1800))))
     with pytest.raises(PointsError, match=rf"^udp:{port}: .* Listen to its port, too: udp:{port},7788"):
         sensor_of(f"udp:{port}")
     send([difop(model, unit_angles(model))])
-    sensor = sensor_of(f"udp:{port}")
-    assert sensor is not None
-    assert sensor.name == "rs-32"
+    assert getattr(sensor_of(f"udp:{port}"), "name", None) == "rs-32"
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -129,9 +96,8 @@ def test_a_run_of_packets_ends_with_silence_or_where_they_are_taken_too_late(
         assert read == [b"first", b"1", b"2", b"3"]
         assert signs
         one.sendto(b"another run", ("127.0.0.1", port))
-        assert [(each.sender, each.port, bytes(each.payload)) for each in Datagrams(source, silent)] == [
-            ("127.0.0.1", port, b"another run")
-        ]
+        (datagram,) = Datagrams(source, silent)
+        assert (*datagram[:2], bytes(datagram.payload)) == ("127.0.0.1", port, b"another run")
         monkeypatch.setattr(ports, "LATE_S", 0.05)
         datagrams = iter(Datagrams(source, silent, endless=True))
         assert bytes(next(datagrams).payload) == b"another run"
@@ -158,7 +124,7 @@ def test_other_names_are_refused(name: str) -> None:
         sensor_of(name)
 
 
-def test_a_port_at_which_nothing_comes_is_said(source: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
+def test_a_port_at_which_nothing_comes_is_said(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "PATIENCE_S", 0.1)
     monkeypatch.setattr(ports, "SILENCE_S", 0.1)
     with pytest.raises(PointsError, match=r"^udp:\d+: no packet came in 0.1 s. Let the sensor send to"):
