@@ -262,8 +262,12 @@ def run_command(arguments: argparse.Namespace) -> int:
                 outcomes = run.image(scan, images[scan], target)
             else:
                 outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
-            for outcome in outcomes:
-                report.add(*outcome)
+            try:
+                for outcome in outcomes:
+                    report.add(*outcome)
+            except (KeyboardInterrupt, SystemExit):  # how what is live ends: its files are finished
+                if not (arguments.live or is_port(scan)):
+                    raise
     n_failed = report.n_failed + sinks.n_failed
     if report.tracks:
         from ..view.tracks import draw_tracks
@@ -656,8 +660,9 @@ def _alone(
 
 def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
     """Time over which the scans of a capture are gathered; None for a sensor that spins, and for scan files."""
-    from ..readers.captures import is_capture
+    from ..readers.captures import is_capture, scan_files
     from ..types.sensor import get_sensor
 
     pattern = get_sensor(sensor).pattern
-    return None if pattern is None or not is_capture(path) else pattern.accumulate_s
+    is_recorded = all(map(is_capture, scan_files(path) if is_folder(path) else [path]))
+    return pattern.accumulate_s if pattern is not None and is_recorded else None

@@ -90,7 +90,6 @@ class Sinks:
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.n_failed = 0
-        self._is_live: bool = arguments.live
         self._is_whole = True
         self._sinks: list[Sink] = []
         self._stack = ExitStack()
@@ -104,8 +103,7 @@ class Sinks:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        # A live source has no end of its own: Ctrl-C is how it ends.
-        self._is_whole = kind is None or (self._is_live and not issubclass(kind, Exception))
+        self._is_whole = kind is None
         self._stack.close()
 
     def write(self, scan: PerceivedScan) -> None:

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -535,7 +536,8 @@ def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, shell: Shell) -> N
 
 
 @pytest.mark.usefixtures("matplotlib")
-def test_files_are_written(tmp_path: Path, shell: Shell) -> None:
+def test_files_are_written(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of what comes at a port are whole when it is interrupted."""
     scan = write_scan(tmp_path / "in" / "000123.bin", 40)
     out = tmp_path / "out"
     (answer,) = shell.records("run", scan, "--out", out, "--png", "--html", "--labels", "--ply")
@@ -545,6 +547,13 @@ def test_files_are_written(tmp_path: Path, shell: Shell) -> None:
     assert b"element vertex 40\n" in (out / "000123.ply").read_bytes()
     assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
     assert answer["n_points"] == 40
+    sent = [*captures.read_scans(scan), *captures.read_scans(scan), None]
+    monkeypatch.setattr(captures, "read_scans", lambda *_, **__: (each or signal.raise_signal(2) for each in sent))
+    monkeypatch.setattr(captures, "known_sensor", lambda *_: None)
+    given = ["--sensor", "hdl-64e", "--track", "--gif", "--out", tmp_path, "--play", out / "play.html"]
+    shell.both("run", "udp:2368", *given, code=130)
+    assert (tmp_path / "tracks.gif").exists()
+    assert (out / "play.html").exists()
 
 
 @pytest.mark.parametrize(

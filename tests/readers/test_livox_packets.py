@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import write_link, write_pcap
+from capture_writers import let_overtake, write_link, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import T0_S, livox_packets, lvx2_file
@@ -25,6 +25,7 @@ from edgeperc.simulation.samples import simulated_scan
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
+Street = tuple[np.ndarray, np.ndarray]
 KINDS = [(1, False), (2, False), (3, False), (0x11, False), (0, True), (1, True), (2, True), (3, True), (4, True)]
 
 
@@ -65,6 +66,7 @@ def test_what_is_written_is_read(tmp_path: Path, kind: int, is_old: bool) -> Non
         assert (np.diff(scan.times_s) >= -1e-9).all()
         assert scan.times_s.max() <= scan.stamp_s  # type: ignore[operator]
         assert np.ptp(scan.times_s) < 0.1005
+    assert len(list(read_timed_scans(let_overtake(path)))) == 3
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3])
@@ -161,7 +163,7 @@ def test_the_hour_of_a_gps() -> None:
 
 
 @pytest.fixture(scope="module")
-def street() -> tuple[np.ndarray, np.ndarray]:
+def street() -> Street:
     """Points of a Mid-360 in a street, 0.3 s of packets."""
     points = np.resize(simulate(random_scene(2), "mid-360", 0, duration_s=1.0).points, (96 * 625, 4))
     return points[:, :3].astype(np.float64), np.rint(255.0 * points[:, 3]).astype(np.int64)
@@ -173,12 +175,7 @@ def street() -> tuple[np.ndarray, np.ndarray]:
     ("name", "options", "gathered_s"), [("a.pcap", [], 0.2), ("a.lvx2", ["--accumulate", 0.1], 0.1)]
 )
 def test_a_capture_without_turns_is_run_gathered(
-    tmp_path: Path,
-    shell: Shell,
-    street: tuple[np.ndarray, np.ndarray],
-    name: str,
-    options: list[object],
-    gathered_s: float,
+    tmp_path: Path, shell: Shell, street: Street, name: str, options: list[object], gathered_s: float
 ) -> None:
     pytest.importorskip("onnxruntime")
     packets, path = livox_packets(1, *street, False), tmp_path / name
@@ -195,9 +192,11 @@ def test_a_capture_without_turns_is_run_gathered(
     assert len(expected) >= 2
     assert np.mean([len(points) for _, points in expected]) > 0.9 * gathered_s * 200_000
     assert any(answer["boxes"] for answer in answers)
+    answers = shell.records("run", tmp_path, "--live", *given)
+    assert {answer["n_points"] for answer in answers} <= {len(points) for _, points in expected}
 
 
-def test_gathered_captures_are_straightened_by_poses(tmp_path: Path, street: tuple[np.ndarray, np.ndarray]) -> None:
+def test_gathered_captures_are_straightened_by_poses(tmp_path: Path, street: Street) -> None:
     """The house's own way: the times of the points go with them, for `deskew` and ``--deskew``."""
     path = write_pcap(tmp_path / "a.pcap", livox_packets(1, *street, False))
     motion = Motion((10.0, 0.0, 0.0))
