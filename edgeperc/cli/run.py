@@ -252,6 +252,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         nothing = f"no scan in this folder; expected scans, captures or a ROS 2 bag's folder{tables}"
         report.add(folder, PointsError(nothing))
     started = time.perf_counter()
+    ended: BaseException | None = None
     with progress("file") as show, Sinks(arguments) as sinks:
         run = _Run(arguments, perceivers, kinds, sinks)
         if has_workers(arguments):
@@ -265,9 +266,11 @@ def run_command(arguments: argparse.Namespace) -> int:
             try:
                 for outcome in outcomes:
                     report.add(*outcome)
-            except (KeyboardInterrupt, SystemExit):  # how what is live ends: its files are finished
+            except (KeyboardInterrupt, SystemExit) as exc:  # how what is live ends: its files are finished
                 if not (arguments.live or is_port(scan)):
                     raise
+                ended = exc
+                break
     n_failed = report.n_failed + sinks.n_failed
     if report.tracks:
         from ..view.tracks import draw_tracks
@@ -283,6 +286,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
         things = "answers" if arguments.live else "images" if images else "scans"
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
+    if ended is not None:
+        raise ended
     return 1 if n_failed else 0
 
 
