@@ -79,7 +79,7 @@ class Listener:
         self.begun = list[Datagram]()  # the first packets of the run that goes on
         self._waiting, self._changed = deque[Datagram](), threading.Condition()
         self._is_new, self._is_late, self._closed = True, False, threading.Event()
-        self._sockets: list[socket.socket] = []
+        self._sockets, self._threads = list["socket.socket"](), list[threading.Thread]()
         for port in ports:
             try:
                 self._sockets.append(_opened((match and match[1]) or "", port))
@@ -89,13 +89,20 @@ class Listener:
                     f"port {port} cannot be listened to ({exc.strerror or exc}); another program may do so "
                     "already, or the address is not one of this computer"
                 ) from exc
-            threading.Thread(target=self._receive, args=(port, self._sockets[-1]), daemon=True).start()
+            self._threads.append(threading.Thread(target=self._receive, args=(port, self._sockets[-1]), daemon=True))
+            self._threads[-1].start()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening; the ports are free."""
+        import socket
+
         self._closed.set()
         for each in self._sockets:
+            with suppress(OSError):  # wakes the thread that waits for a packet and so keeps the port
+                each.shutdown(socket.SHUT_RDWR)
             each.close()
+        for thread in self._threads:
+            thread.join()
 
     def first(self, alive: Callable[[], None]) -> list[Datagram]:
         """The first packets of this run."""
@@ -135,18 +142,20 @@ class Listener:
     def _receive(self, port: int, of_port: socket.socket) -> None:
         while not self._closed.is_set():
             try:
-                payload, (address, *_) = of_port.recvfrom(_MOST_BYTES)
+                payload, sender = of_port.recvfrom(_MOST_BYTES)
             except TimeoutError:
                 continue
             except OSError:  # closed, or a network that is down and may come back
                 self._closed.wait(_TICK_S)
                 continue
+            if self._closed.is_set():
+                return
             now_s = time.time()
             with self._changed:
                 if self._waiting and not 0.0 <= now_s - self._waiting[0].stamp_s < LATE_S:
                     self._waiting.clear()
                     self._is_late = True
-                self._waiting.append(Datagram(address, port, now_s, memoryview(payload)))
+                self._waiting.append(Datagram(sender[0], port, now_s, memoryview(payload)))
                 self._changed.notify()
 
 

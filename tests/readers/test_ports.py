@@ -69,6 +69,16 @@ def test_where_the_angles_come_is_said(port: int, send: Sender) -> None:
     assert getattr(sensor_of(f"udp:{port}"), "name", None) == "rs-32"
 
 
+def test_a_port_that_is_released_is_free(source: Path) -> None:
+    """At once, not when the thread that waits for packets looks up: half a second later."""
+    found = set()
+    for _ in range(5):
+        found.add(ports.listen(source))
+        time.sleep(0.02)
+        ports.release(source)
+    assert len(found) == 5
+
+
 @pytest.mark.usefixtures("in_this_process")
 def test_a_stream_takes_ports(port: int, source: Path, send: Sender) -> None:
     """As they come, whatever the times in the packets."""
