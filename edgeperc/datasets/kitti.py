@@ -333,11 +333,13 @@ def _check_once(rows: Sequence[dict[str, str]], table: Path) -> None:
 
 
 def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
-    """Yield the boxes of every KITTI label file below ``root``, except those of test drives: layouts to simulate."""
+    """Yield the boxes of each scan in the table of KITTI's labels, but for test drives; PointsError without one."""
     root = Path(root)
-    for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
-        calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
-        yield label_objects(read_labels(root / "label_2" / f"{name}.txt"), calibration)[0]
+    names = [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]
+    if not (names and (root / "label_2").is_dir()):
+        raise PointsError(f"{root} lacks label_2, or frames.csv with drives to train on; expected KITTI's, with calib")
+    for name in names:
+        yield read_labeled(root, name)[0]
 
 
 ROAD_CLASSES = ("other", "road", "vehicle")

@@ -21,6 +21,7 @@ from edgeperc.datasets.kitti import (
     SemanticKitti,
     label_objects,
     layouts,
+    read_labeled,
     read_labels,
 )
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold_of, in_split
@@ -313,11 +314,16 @@ def test_layouts_of_test_drives_are_left_out(data_root: Callable[[str], Path]) -
     assert any(d in (root / "frames.csv").read_text() for d in TEST_DRIVES)
     rows = (root / "frames.csv").read_text().splitlines()[1:]
     kept = [r for r in rows if not any(d in r for d in TEST_DRIVES)]
-    first = next(iter(layouts(root)))
-    name = kept[0].split(",")[0]
-    calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
-    assert first == label_objects(read_labels(root / "label_2" / f"{name}.txt"), calibration)[0]
+    assert next(layouts(root)) == read_labeled(root, kept[0].split(",")[0])[0]
     assert sum(1 for _ in itertools.islice(layouts(root), 50)) == 50
+
+
+@pytest.mark.parametrize("drive", [min(TEST_DRIVES), "2011_09_26_drive_0001"])  # without a layout; without labels
+def test_a_folder_without_layouts_is_an_error(tmp_path: Path, drive: str) -> None:
+    (tmp_path / "frames.csv").write_text(f"name,drive\n000000,{drive}\n")
+    for folder in (tmp_path, tmp_path / "mistyped"):  # else scenes are drawn without layouts, for hours
+        with pytest.raises(PointsError, match=r"lacks label_2, or frames\.csv"):
+            next(layouts(folder))
 
 
 def test_real_boxes_are_full_of_points(kitti_root: Path) -> None:
