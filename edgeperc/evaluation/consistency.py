@@ -199,7 +199,7 @@ def _standing(scans: Sequence[_Scan], smoothed: Sequence[Tracks]) -> Iterator[_S
                 if tracks.session != smoothed[of].session or abs(tracks.stamp_s - smoothed[of].stamp_s) > _LOOK_S:
                     break
                 R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
-                (box,) = moved_boxes([end.world_box], R.T, -R.T @ t)
+                (box,) = moved_boxes([end.world_box], (R.T, -R.T @ t))
                 n_returns = scan.counted[inside(box, scan.counted), 3].sum()
                 if n_returns >= FEWEST_RETURNS and not _covers(tracks.boxes, [box]).any():
                     is_detected = bool(_covers(np.array([[*box.center, *box.size, box.yaw]]), scan.boxes).any())

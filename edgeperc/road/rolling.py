@@ -60,7 +60,7 @@ class RollingGrid:
     Raises
     ------
     OptionError
-        A number is out of its range, the grid has too many cells, or ``classes`` is a single name.
+        A number is out of its range, the grid has too many cells, or ``classes`` is a single name, or of numbers.
 
     Examples
     --------

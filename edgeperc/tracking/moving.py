@@ -28,10 +28,10 @@ MOVABLE = frozenset(
 
 
 def as_classes(names: Collection[str]) -> frozenset[str]:
-    """Names of classes; OptionError for a single name, whose letters or parts would be the classes."""
-    if isinstance(names, str | bytes) or not isinstance(names, Iterable):
+    """Names of classes; OptionError for numbers of classes, or a single name, whose letters would be the classes."""
+    if isinstance(names, str):
         raise OptionError(f"classes is {names!r}; expected a collection of names, such as {{{names!r}}}")
-    return frozenset(names)
+    return frozenset(OPTIONS.each("classes", names, str))
 
 
 def moving_tracks(
@@ -42,11 +42,10 @@ def moving_tracks(
 
     A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
     """
-    for name, value in (("min_speed_mps", min_speed_mps or 0.0), ("n_sigmas", n_sigmas)):
-        OPTIONS.number(name, value, 0.0)
-    found = []
-    for track in tracks:
-        slowest = track.moving_mps if min_speed_mps is None else min_speed_mps
+    least = None if min_speed_mps is None else OPTIONS.number("min_speed_mps", min_speed_mps, 0.0)
+    n_sigmas, found = OPTIONS.number("n_sigmas", n_sigmas, 0.0), []
+    for track in OPTIONS.each("tracks", tracks, Track):
+        slowest = track.moving_mps if least is None else least
         speed, sigma = abs(float(track.state[2])), math.sqrt(max(float(track.covariance[2, 2]), 0.0))
         if speed > max(slowest, n_sigmas * sigma):
             found.append(track)
@@ -82,7 +81,7 @@ def moving_points(
     Raises
     ------
     OptionError
-        An option is negative or not finite.
+        An option is negative or not finite, or a track is none.
     PointsError
         ``points`` is not a scan.
     """
@@ -114,7 +113,7 @@ def movable_points(
     Raises
     ------
     OptionError
-        ``margin_m`` is negative or not finite, or ``classes`` is a single name.
+        ``margin_m`` is negative or not finite, or ``classes`` is a single name, or of numbers.
     PointsError
         ``points`` is not the scan of the perception.
     """
@@ -128,10 +127,7 @@ def movable_points(
 
 def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
     margin_m = OPTIONS.number("margin_m", margin_m, 0.0)
-    rows = [
-        (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
-        for box in boxes
-    ]
+    rows = [(*b.center, *(n / 2.0 + margin_m for n in b.size), math.cos(b.yaw), math.sin(b.yaw)) for b in boxes]
     inside = np.empty(len(points), np.bool_)
     mark_in_boxes(read_only(np.array(rows, np.float64).reshape(-1, 8), np.float64), read_only(points), inside)
     return inside

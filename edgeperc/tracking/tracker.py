@@ -187,8 +187,8 @@ class Tracker:
             ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
             separated from the sensor's: tracks keep their identity, but speeds over ground are unreliable.
         mounting : Mounting
-            Of the sensor (`Perception.mounting`): without poses, it says which way the vehicle drives, which moves fast
-            ahead, hardly aside and not up or down.
+            Of the sensor (`Perception.mounting`), else OptionError: without poses, it says which way the vehicle
+            drives, which moves fast ahead, hardly aside and not up or down.
 
         Returns
         -------
@@ -208,6 +208,8 @@ class Tracker:
         UserWarning
             A scan was late or doubled, or the clock jumped; once each.
         """
+        if not isinstance(mounting, Mounting):
+            OPTIONS.refuse("mounting", mounting, "a Mounting")
         stamp_s = float(as_seconds(stamp_s))
         if not abs(stamp_s) <= LATEST_S:
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")

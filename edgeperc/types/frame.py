@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
@@ -70,11 +71,11 @@ class ModelFrame:
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
-        return tuple(boxes) if self.is_identity else moved_boxes(boxes, self.R, self.t)
+        return moved_boxes(boxes, None if self.is_identity else (self.R, self.t))
 
     def boxes_back(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the models' frame in the frame of the scan."""
-        return tuple(boxes) if self.is_identity else moved_boxes(boxes, self.R.T, -self.R.T @ self.t)
+        return moved_boxes(boxes, None if self.is_identity else (self.R.T, -self.R.T @ self.t))
 
 
 OF_MODELS = ModelFrame(MODEL_MOUNTING)
@@ -133,10 +134,13 @@ def _moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Fl
     return read_only(moved)
 
 
-def moved_boxes(boxes: Iterable[Box], R: Floats, t: Floats) -> tuple[Box, ...]:
+def moved_boxes(boxes: Iterable[Box], motion: tuple[Floats, Floats] | None) -> tuple[Box, ...]:
     """Boxes whose centers p lie at ``R p + t`` [m], with the headings that R gives them; they stay upright."""
-    moved = []
-    for box in boxes:
+    given, moved = OPTIONS.each("boxes", boxes, Box), []
+    if motion is None:
+        return given
+    R, t = motion
+    for box in given:
         x, y, z = (R @ np.array(box.center) + t).tolist()
         ahead = R[:, 0] * math.cos(box.yaw) + R[:, 1] * math.sin(box.yaw)
         moved.append(replace(box, center=(x, y, z), yaw=math.atan2(ahead[1], ahead[0])))

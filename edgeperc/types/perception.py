@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import ModelError, OptionError, PointsError
-from ..system.fields import Fields
+from ..system.fields import OPTIONS, Fields
 from .choices import DEFAULT_SENSOR, STATIC
 from .mounting import MODEL_MOUNTING, Mounting
 from .points import Floats, Floats32, Ints, Labels, Mask, Points, as_points, by_axes
@@ -459,7 +459,7 @@ class Perception:
         return self.in_map(self.boxes)
 
     def in_map(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
-        """Boxes in the frame of the scan, such as those of tracks, with their centers in the map.
+        """Boxes in the frame of the scan, such as the ``box`` of each track, with their centers in the map.
 
         Raises
         ------
@@ -467,7 +467,7 @@ class Perception:
             The place of the scan in a map was not given.
         """
         ox, oy, oz = self._origin()
-        placed = [(box, *box.center) for box in boxes]
+        placed = [(box, *box.center) for box in OPTIONS.each("boxes", boxes, Box)]
         return tuple(replace(box, center=(x + ox, y + oy, z + oz)) for box, x, y, z in placed)
 
     def _origin(self) -> tuple[float, float, float]:

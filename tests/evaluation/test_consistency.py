@@ -90,7 +90,7 @@ def test_what_stands_is_looked_for_where_the_sensor_is(far_m: float) -> None:
         turn, pose = 0.01 * k, np.eye(4)
         pose[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
         pose[:3, 3] = far_m + 0.3 * k, far_m, 0.0
-        (box,) = moved_boxes([PARKED], pose[:3, :3].T, -pose[:3, :3].T @ (pose[:3, 3] - (far_m, far_m, 0.0)))
+        (box,) = moved_boxes([PARKED], (pose[:3, :3].T, -pose[:3, :3].T @ (pose[:3, 3] - (far_m, far_m, 0.0))))
         points = points_on(box)
         perception = perceived(points, 0.1 * k, *([box] if k < 15 else []))
         consistency.add(perception, points, tracker(perception, pose))

@@ -187,6 +187,8 @@ def test_scans_of_the_training_vehicle_are_not_moved(scans: list[NDArray[np.floa
     frame = ModelFrame(MODEL_MOUNTING)
     assert frame.is_identity
     assert frame.move(scans[0]) is scans[0]
+    with pytest.raises(OptionError, match=r"boxes\[0\] is 3; expected a Box"):
+        frame.move_boxes([3])  # type: ignore[list-item]
     for unknown in (Mounting(), None):
         with pytest.raises(OptionError, match=r"mounting is .*; expected one with a height_m"):
             ModelFrame(unknown)  # type: ignore[arg-type]

@@ -128,7 +128,10 @@ def test_errors_name_the_reason() -> None:
             moving_points(tracks, points, **options)
     with pytest.raises(PointsError, match="expected"):
         moving_points(tracks, np.zeros((3, 2)))
-    with pytest.raises(OptionError, match="classes is 'cars'"):  # which has car in it
-        movable_points(perceived(3), points, classes="cars")
+    for classes, reason in (("cars", "classes is 'cars'"), ((1, 2), r"classes\[0\] is 1")):  # cars has car in it
+        with pytest.raises(OptionError, match=reason):
+            movable_points(perceived(3), points, classes=classes)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match=r"tracks\[0\] is Box.*; expected a Track"):
+        moving_points([track.box for track in tracks], points)  # type: ignore[misc]
     with pytest.raises(PointsError, match="3 points and a perception of 4"):
         movable_points(perceived(4), points)

@@ -500,6 +500,8 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
                 tracker.update(boxes, stamp_s, given_pose)
         with pytest.raises(TrackingError, match="unlike those before"):
             tracker.update(boxes, 0.1 * k + 0.05, None if posed else pose)
+        with pytest.raises(OptionError, match=r"mounting is 1\.9; expected a Mounting"):
+            tracker.update(boxes, 0.1 * k + 0.05, given_pose, mounting=1.9)  # type: ignore[arg-type]
     for no_boxes in (None, 1, [None], "box"):
         with pytest.raises(TrackingError, match=r"pass edgeperc\.Box objects"):
             Tracker().update(no_boxes, 0.0)  # type: ignore[arg-type]

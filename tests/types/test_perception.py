@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from edgeperc import (
     Box,
     ModelError,
+    OptionError,
     Perception,
     PointLabels,
     PointsError,
@@ -238,6 +239,8 @@ def test_boxes_and_points_are_placed_in_the_map(origin: tuple[float, float, floa
     points = np.random.default_rng(0).normal(0.0, 30.0, (50, 4)).astype(np.float32)
     in_map = perception.to_map(points)
     assert in_map.dtype == np.float64
+    with pytest.raises(OptionError, match=r"boxes\[0\] is 3; expected a Box"):
+        perception.in_map([3])  # type: ignore[list-item]
     np.testing.assert_array_equal(in_map, points[:, :3].astype(np.float64) + np.array(origin))
     np.testing.assert_array_equal((in_map - np.array(origin)).astype(np.float32)[:, 1:2], points[:, 1:2])
     record = json.loads(json.dumps(scan_record(perception)))
