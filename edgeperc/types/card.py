@@ -281,18 +281,16 @@ class ModelCard:
                 raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
             if not self.box_classes:
                 raise CardError("a box output without box_classes; expected the classes that boxes may have")
-        unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
-        if unlisted:
-            raise CardError(f"box classes {reprlib.repr(unlisted)} are not among the classes {self.classes}")
+        for name in ("box_classes", "box_size_priors"):
+            if unlisted := [c for c in getattr(self, name) if c not in self.classes]:
+                raise CardError(f"{name} has {reprlib.repr(unlisted)}, not among the classes {self.classes}")
         if self.classes[0] in self.box_classes:
             raise CardError(
                 f"box_classes {reprlib.repr(self.box_classes)} hold {reprlib.repr(self.classes[0])}, the first of the "
                 "classes, which is the background; list the background first in classes, and no box has it"
             )
-        if (
-            self.box_size_spreads
-            and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
-        ):
+        sized = self.box_size_spreads.keys() & self.box_size_priors.keys()
+        if self.box_size_spreads and not {*self.box_classes} <= sized:
             raise CardError(
                 f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
             )
