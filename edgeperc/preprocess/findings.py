@@ -625,14 +625,13 @@ def with_raw_remission(findings: Iterable[Finding], points: Points, sensor: Sens
     placed = None if is_mistaken else _place_as_remission(points)
     if placed is not None:
         return placed, *(finding for finding in found if "emission" not in finding)
-    remission = points[:, 3]
     if not any(finding.startswith(_ALL_ZERO) for finding in found):
         return found
-    known = remission[np.isfinite(remission)].astype(np.float64)  # float32 may overflow in a difference
-    if not (known > 0.0).any() or np.ptp(known) == 0.0:
-        return found
+    known = points[np.isfinite(points[:, 3]), 3].astype(np.float64)  # float32 may overflow in a difference
     low, high = sensor.remission_range
-    brightest = float(np.percentile(known, 99))
+    brightest = float(np.percentile(known, 99)) if len(known) else high
+    if not (known > 0.0).any() or np.ptp(known) == 0.0 or brightest - low > 0.2 * (high - low):
+        return found
     likely, own = _likely_range(float(known.min()), float(known.max())), f"({low:g}, {high:g})"
     there = _gross(
         f"Remission hardly exceeds {brightest:.2g}, but the profile {sensor.name} has {low:g} to {high:g}: pass "

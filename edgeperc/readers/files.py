@@ -280,7 +280,7 @@ def _of_stored(array: NDArray[Any], options: FileOptions) -> _Read:
     if options.columns is None:
         raise PointsError(
             f"the array has the shape {array.shape}; expected (n, 4): x, y, z, remission. Say what its columns hold: "
-            "columns=, or --columns x y z intensity ring"
+            "columns=, or --columns x y z intensity ring; of a set of labeled scans, keep these four"
         )
     names = column_names(options.columns)
     if len(names) != array.shape[1]:

@@ -179,6 +179,8 @@ def test_a_missing_remission_is_called_so(value: float) -> None:
     zeros = (Finding("Remission is 0 for 100% of the points: the field is missing", True), Finding("another"))
     assert with_raw_remission(zeros, raw, profile) == zeros
     assert with_raw_remission((), raw, profile) == ()
+    raw[::50, 3] = profile.remission_range[1]  # of whole numbers, nearly all 0: the unit is right
+    assert with_raw_remission(zeros, raw, profile) == zeros
 
 
 @pytest.mark.parametrize("sensor", ["vlp-16", "hdl-64e", "os1-128", "pandar64"])
