@@ -274,7 +274,7 @@ class Perceiver:
         self._finds_sensor = isinstance(sensor, str) and sensor == AUTO_SENSOR
         self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
         self.on_mismatch = on_mismatch
-        self.score_threshold = score_threshold
+        self.score_threshold = None if score_threshold is None else float(score_threshold)
         self.adapt = adapt
         self._interpolates = adapt in ("both", "interpolation")
         self._renders = adapt in ("both", "remission")

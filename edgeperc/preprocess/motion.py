@@ -266,7 +266,7 @@ class Trajectory:
         around = [*self._around(at_s, at_s)]
         begin_s, end_s = self.times_s[around].tolist()
         first, second = ((T[:3, 3], np.array(quaternion(T[:3, :3]))) for T in self.T_world_sensor[around])
-        return pose_between(first, second, (at_s - begin_s) / (end_s - begin_s))
+        return pose_between(first, second, (as_seconds(at_s) - begin_s) / (end_s - begin_s))
 
     def _around(self, first_s: float, last_s: float) -> tuple[int, int]:
         """The last pose before a scan and the first one after it; errors as `motion`."""

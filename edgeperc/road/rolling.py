@@ -84,7 +84,7 @@ class RollingGrid:
         self._margin_m = OPTIONS.number("margin_m", margin_m, 0.0, 10.0)
         check_height(min_height_m)
         self._min_height_m, self._classes = min_height_m, as_classes(classes)
-        n = round(size_m / cell_m)
+        n = round(float(size_m) / self._cell_m)
         # A scan's own cells lie around the sensor, turned; in their square, the window fits however it is turned.
         reach_m = (math.ceil(n * math.sqrt(0.5)) + 1) * self._cell_m
         try:

@@ -29,7 +29,7 @@ MOVABLE = frozenset(
 
 def as_classes(names: Collection[str]) -> frozenset[str]:
     """Names of classes; OptionError for numbers of classes, or a single name, whose letters would be the classes."""
-    if isinstance(names, str):
+    if isinstance(names, str | bytes) or not isinstance(names, Iterable):
         raise OptionError(f"classes is {names!r}; expected a collection of names, such as {{{names!r}}}")
     return frozenset(OPTIONS.each("classes", names, str))
 

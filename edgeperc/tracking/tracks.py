@@ -69,9 +69,9 @@ class ClassParameters:
         for each in fields(self):
             value, bounds = getattr(self, each.name), _BOUNDS.get(each.name, (1e-6, 1e6))
             if each.name == "shape_m":
-                OPTIONS.numbers(each.name, value, 4, *bounds)
+                object.__setattr__(self, each.name, OPTIONS.numbers(each.name, value, 4, *bounds))
             elif each.name != "group":
-                OPTIONS.number(each.name, value, *bounds)
+                object.__setattr__(self, each.name, OPTIONS.number(each.name, value, *bounds))
 
 
 # The weights of scores were chosen on ten KITTI sequences. Only far_logit was fixed on one half and confirmed on the
@@ -195,7 +195,7 @@ class Track:
         OptionError
             ``ahead_s`` is no such number.
         """
-        OPTIONS.number("ahead_s", ahead_s, 0.0, 60.0)
+        ahead_s = OPTIONS.number("ahead_s", ahead_s, 0.0, 60.0)  # a float32 would round the box
         _, _, speed, heading, turn_rate = self.state.tolist()
         half = 0.5 * turn_rate * ahead_s
         chord_m = speed * ahead_s * (math.sin(half) / half if half else 1.0)

@@ -243,6 +243,7 @@ def test_a_track_is_predicted_as_its_filter_does(
     ahead = pose[:3, :3].T @ [math.cos(predicted.yaw), math.sin(predicted.yaw), 0.0]
     assert seen.yaw == pytest.approx(math.atan2(ahead[1], ahead[0]))
     later = track.predicted(2.0)
+    assert track.predicted(np.float16(2.0)) == later  # not rounded to that type
     assert track.to_dict()["predicted"][1] == pytest.approx([*later.center, later.yaw], abs=1e-4)
 
 
