@@ -127,7 +127,10 @@ def movable_points(
 
 def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
     margin_m = OPTIONS.number("margin_m", margin_m, 0.0)
-    rows = [(*b.center, *(n / 2.0 + margin_m for n in b.size), math.cos(b.yaw), math.sin(b.yaw)) for b in boxes]
+    rows = [
+        (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
+        for box in boxes
+    ]
     inside = np.empty(len(points), np.bool_)
     mark_in_boxes(read_only(np.array(rows, np.float64).reshape(-1, 8), np.float64), read_only(points), inside)
     return inside
