@@ -252,25 +252,25 @@ def run_command(arguments: argparse.Namespace) -> int:
         nothing = f"no scan in this folder; expected scans, captures or a ROS 2 bag's folder{tables}"
         report.add(folder, PointsError(nothing))
     started = time.perf_counter()
-    ended: BaseException | None = None
-    with progress("file") as show, Sinks(arguments) as sinks:
-        run = _Run(arguments, perceivers, kinds, sinks)
-        if has_workers(arguments):
-            perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
-        for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
-            show(done, len(scans))
-            if images:
-                outcomes = run.image(scan, images[scan], target)
-            else:
-                outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
-            try:
+    of_ports, ended = any(map(is_port, scans)), None
+    sinks = Sinks(arguments, of_ports=of_ports)
+    try:
+        with progress("file") as show, sinks:
+            run = _Run(arguments, perceivers, kinds, sinks)
+            if has_workers(arguments):
+                perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
+            for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
+                show(done, len(scans))
+                if images:
+                    outcomes = run.image(scan, images[scan], target)
+                else:
+                    outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
                 for outcome in outcomes:
                     report.add(*outcome)
-            except (KeyboardInterrupt, SystemExit) as exc:  # how what is live ends: its files are finished
-                if not (arguments.live or is_port(scan)):
-                    raise
-                ended = exc
-                break
+    except (KeyboardInterrupt, SystemExit) as exc:  # how what is live ends: its animation comes, too
+        if not (arguments.live or of_ports):
+            raise
+        ended = exc
     n_failed = report.n_failed + sinks.n_failed
     if report.tracks:
         from ..view.tracks import draw_tracks

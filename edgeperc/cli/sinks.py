@@ -88,8 +88,9 @@ class Sinks:
     of the others. ``n_failed`` counts files that could not be finished.
     """
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
+    def __init__(self, arguments: argparse.Namespace, *, of_ports: bool = False) -> None:
         self.n_failed = 0
+        self._is_live: bool = arguments.live or of_ports
         self._is_whole = True
         self._sinks: list[Sink] = []
         self._stack = ExitStack()
@@ -103,7 +104,8 @@ class Sinks:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._is_whole = kind is None
+        # A live source has no end of its own: Ctrl-C is how it ends.
+        self._is_whole = kind is None or (self._is_live and not issubclass(kind, Exception))
         self._stack.close()
 
     def write(self, scan: PerceivedScan) -> None:
