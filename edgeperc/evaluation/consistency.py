@@ -36,8 +36,9 @@ class Consistency:
     """How consistent the answers of a drive are: what takes no labels to see.
 
     The tracks of the whole drive (`edgeperc.smooth_tracks`) stand for the truth. A vehicle that stands must also be
-    detected in the scans of 3 s before its first and after its last detection, if it returns three points in view. An
-    object that was never tracked is in no figure, so a share ``detected`` tends to be above the true recall.
+    detected in the scans of 3 s before its first and after its last detection, if it returns three points in view. What
+    was never tracked is in no figure, and what is half hidden, which labels often leave out, is expected: ``detected``
+    compares drives, sensors and distances, and is not the recall of labels.
 
     Examples
     --------
