@@ -535,7 +535,7 @@ def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, shell: Shell) -> N
     assert "there is no such file or folder" in shell.err("run", tmp_path / "absent", "--live")
 
 
-@pytest.mark.usefixtures("matplotlib")
+@pytest.mark.usefixtures("matplotlib", "foreground")
 def test_files_are_written(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of what comes at a port are whole when it is interrupted."""
     scan = write_scan(tmp_path / "in" / "000123.bin", 40)
@@ -548,7 +548,9 @@ def test_files_are_written(tmp_path: Path, shell: Shell, monkeypatch: pytest.Mon
     assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
     assert answer["n_points"] == 40
     sent = [*captures.read_scans(scan), *captures.read_scans(scan), None]
-    monkeypatch.setattr(captures, "read_scans", lambda *_, **__: (each or signal.raise_signal(2) for each in sent))
+    monkeypatch.setattr(
+        captures, "read_scans", lambda *_, **__: (each or signal.raise_signal(signal.SIGINT) for each in sent)
+    )
     monkeypatch.setattr(captures, "known_sensor", lambda *_: None)
     given = ["--sensor", "hdl-64e", "--track", "--gif", "--out", tmp_path, "--play", out / "play.html"]
     shell.both("run", "udp:2368", *given, code=130)
