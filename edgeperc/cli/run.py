@@ -669,5 +669,7 @@ def _gathered_s(path: Path, sensor: str | SensorProfile) -> float | None:
     from ..types.sensor import get_sensor
 
     pattern = get_sensor(sensor).pattern
+    if pattern is None:
+        return None
     is_recorded = all(map(is_capture, scan_files(path) if is_folder(path) else [path]))
-    return pattern.accumulate_s if pattern is not None and is_recorded else None
+    return pattern.accumulate_s if is_recorded else None

@@ -126,6 +126,9 @@ def test_errors_name_the_reason() -> None:
     assert consistency.figures()["n_scans"] == 0
 
 
+FIRST = 4  # scans without a detection
+
+
 class Seeing:
     """Perceives a parked car in all scans but the first four."""
 
@@ -134,7 +137,7 @@ class Seeing:
 
     def __call__(self, points: NDArray[np.float32], stamp_s: float | None = None, **_: Any) -> Perception:
         self.n += 1
-        return perceived(points, stamp_s or 0.0, *([PARKED] if 4 < self.n <= 10 else []))
+        return perceived(points, stamp_s or 0.0, *([PARKED] if FIRST < self.n <= 10 else []))
 
 
 def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shell: Shell) -> None:
@@ -151,6 +154,10 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.
     assert json.loads(file.read_text())["classes"]["car"]["15-30 m"]["detected"] == 0.6
     printed = shell.err("run", drive / "000000.bin", "--sensor", "hdl-64e", "--track", "--consistency", file, code=0)
     assert "consistency of 1 scan of 1 drive, without labels [%]: nothing was detected" in printed
+    monkeypatch.setattr("test_consistency.FIRST", 0)
+    printed = shell.err("run", drive, "--sensor", "hdl-64e", "--track", "--consistency", file, code=0)
+    assert "100.0" in printed
+    assert "look first" not in printed  # nothing contradicts itself
     for options in ([], ["--track", "--live"]):
         refused = "--consistency needs --track, and no --live"
         assert refused in shell.err("run", drive, *options, "--consistency", file)

@@ -44,8 +44,9 @@ class ConsistencySink:
         ]
         scans, drives = many(figures["n_scans"], "scan"), many(figures["n_drives"], "drive")
         title = f"consistency of {scans} of {drives}, without labels [%]"
-        worst = sorted(figures["scans"], key=lambda scan: -scan["missed"] - scan["lone"])[:3]
+        contradicted = [scan for scan in figures["scans"] if scan["missed"] or scan["lone"]]
+        worst = sorted(contradicted, key=lambda scan: -scan["missed"] - scan["lone"])[:3]
         named = [f"{scan['scan']} ({scan['missed']} missed, {scan['lone']} lone)" for scan in worst]
-        lines = [*table_lines(title, _COLUMNS, rows), f"look first at {', '.join(named)}"]
+        lines = [*table_lines(title, _COLUMNS, rows), *[f"look first at {', '.join(named)}"] * bool(named)]
         for line in lines if rows else [f"{title}: nothing was detected"]:
             print_line(line, sys.stderr)
