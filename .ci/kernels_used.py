@@ -72,12 +72,14 @@ def run() -> None:
         main(["run", f"{folder}/scan.bin"])
     for name, set_up in itertools.product(("hdl-64e", "vlp-16"), SET_UPS):
         perceive, tracker = edgeperc.Perceiver(sensor=name, on_mismatch="ignore", **set_up), edgeperc.Tracker()
-        rolling, online = edgeperc.RollingGrid(), []
+        rolling, online, sweeps = edgeperc.RollingGrid(), [], edgeperc.Sweeps()
         scans = [simulated_scan(seed, name).points for seed in (1, 2)]
         for k, points in enumerate((*scans, *scans, np.zeros((0, 4), np.float32))):
             given = points * np.float32([1, 1, 1, 255]) if name == "vlp-16" else points
-            perception = perceive(given, stamp_s=0.1 * k)
+            earlier = sweeps.earlier(given, 0.1 * k, np.eye(4))
+            perception = perceive(given, stamp_s=0.1 * k, earlier=earlier)
             online.append(tracker.update(perception.boxes, 0.1 * k))
+            sweeps.add(given, perception, online[-1])
             edgeperc.occupancy_grid(perception, given, sensor=name)
             rolling.update(perception, given, np.eye(4), sensor=name)
             if perception.top_view is not None:

@@ -55,12 +55,14 @@ if TYPE_CHECKING:
     from .readers.captures import read_scans, read_timed_scans, sensor_of
     from .readers.files import find_origin, read_points
     from .readers.images import read_image
+    from .readers.scan_odometry import Odometry
     from .readers.times import TimedScan, accumulate
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
     from .road.rolling import RollingGrid
     from .tracking import Track, Tracker, Tracks, smooth_tracks
     from .tracking.moving import movable_points, moving_points
+    from .tracking.sweeps import Sweeps
     from .tracking.zones import Crossing, Line, Zone
     from .types.card import ModelCard
     from .types.frame import ModelFrame
@@ -105,6 +107,7 @@ __all__ = [
     "Mounting",
     "MountingError",
     "OccupancyGrid",
+    "Odometry",
     "OptionError",
     "Perceiver",
     "Perception",
@@ -123,6 +126,7 @@ __all__ = [
     "SplitError",
     "StampError",
     "Stream",
+    "Sweeps",
     "TimedScan",
     "TopView",
     "Track",
@@ -165,6 +169,7 @@ _NAMES = {
     "live": ("Answer", "Stream", "stream"),
     "perceiver": ("Perceiver",),
     "preprocess.motion": ("Motion", "Trajectory", "deskew", "merge"),
+    "readers.scan_odometry": ("Odometry",),
     "readers.captures": ("read_scans", "read_timed_scans", "sensor_of"),
     "readers.files": ("find_origin", "read_points"),
     "readers.images": ("read_image",),
@@ -174,6 +179,7 @@ _NAMES = {
     "road.rolling": ("RollingGrid",),
     "tracking": ("Track", "Tracker", "Tracks", "smooth_tracks"),
     "tracking.moving": ("movable_points", "moving_points"),
+    "tracking.sweeps": ("Sweeps",),
     "tracking.zones": ("Crossing", "Line", "Zone"),
     "types.card": ("ModelCard",),
     "types.frame": ("ModelFrame",),

@@ -509,6 +509,7 @@ class Perceiver:
         *,
         image: ArrayLike | None = None,
         origin_m: Sequence[float] | None = None,
+        earlier: ArrayLike | None = None,
     ) -> Perception:
         """Perceive one scan, one image, or a scan and an image of the same moment.
 
@@ -526,6 +527,10 @@ class Perceiver:
         origin_m : sequence of 3 float or None
             Place of the points' frame in a map [m]: what `edgeperc.read_points` subtracted. It is not subtracted here,
             but returned in the perception, which places its boxes in the map (`Perception.map_boxes`).
+        earlier : (m, 4) or (m, 3) array_like, optional
+            Points of earlier scans on what stands still, in the frame and unit of this one (`Sweeps.earlier`). They
+            help to find the ground and objects, but get no labels, and neither labels of points nor cells depend on
+            them otherwise.
 
         Raises
         ------
@@ -548,6 +553,7 @@ class Perceiver:
         place = None if origin_m is None else as_origin(origin_m)
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
+        before = None if earlier is None else as_points(earlier)
         with self._calls.one():
             watch = Stopwatch()
             if scan is None:
@@ -557,7 +563,7 @@ class Perceiver:
                     self._find_sensor(scan)
                     watch.lap("check")
                 check = self._to_check > 0 and len(scan) > 0
-                perception = self._perceive(scan, stamp_s, watch, check)
+                perception = self._perceive(scan, stamp_s, watch, check, before)
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
@@ -593,7 +599,9 @@ class Perceiver:
                 f"got an image, and none of the models is of a camera ({loaded}); add one such as {CAMERA} to models="
             )
 
-    def _perceive(self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
+    def _perceive(
+        self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool, earlier: Points | None
+    ) -> Perception:
         given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
         hidden: tuple[findings.Finding | None, ...] = ()
         turned: tuple[findings.Finding, ...] = ()
@@ -602,6 +610,8 @@ class Perceiver:
         if self._renders:
             self._remission, profile, matched = matcher.add(scan)
         scan, n_overflowed = scale(scan, profile, rendered=self._renders)
+        if earlier is not None:
+            earlier, _ = scale(returns(earlier, profile, before.known.origin_m)[0], profile, rendered=self._renders)
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         roll_deg = before.known.roll_deg
@@ -620,11 +630,12 @@ class Perceiver:
             watch.lap("check")
         if check and (roll_deg, before.known.pitch_deg) != (None, None):
             lying = findings.about_lying(before.known)
-            hidden = (*hidden, lying, self._about_given_tilt(before.contradicted_by(scan)))
+            hidden = (*hidden, lying, findings.about_given_tilt(self._mounting, before.contradicted_by(scan)))
             watch.lap("check")
         upright = profile.upright(before.known)
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
+            earlier = None if earlier is None else self._frame.move(earlier)
             watch.lap("adapt")
         fitness = findings.check_dropped(given, dropped, profile) if check else ()
         if check and not fitness:
@@ -644,7 +655,7 @@ class Perceiver:
                 if self._to_check == CHECKED_SCANS:  # no scan before it told the sensor
                     self._sensor_estimate = None
                 raise
-        scan, health, parts = self._without_drops(scan, given, upright, watch)
+        scan, health, parts = self._without_drops(scan, given, upright, watch, earlier)
         return Perception(
             n_points=len(scan),
             n_dropped=dropped.total,
@@ -664,7 +675,7 @@ class Perceiver:
         )
 
     def _without_drops(
-        self, scan: Points, given: Points, profile: SensorProfile, watch: Stopwatch
+        self, scan: Points, given: Points, profile: SensorProfile, watch: Stopwatch, earlier: Points | None
     ) -> tuple[Points, SensorHealth, Parts]:
         """The scan without rain and snow, the sensor's health (by the scan as given), and what is perceived.
 
@@ -677,14 +688,14 @@ class Perceiver:
             sample = given[:: sample_step(len(given))]
             own = self._frame.move(own_returns(sample, profile, self._estimator.known.origin_m))
         check = partial(check_health, sensor=profile, normal=self._normal, eye_m=self._frame.eye, own=own)
-        parts = None if self._has_drops else self._pipeline(scan, self._mounting, watch, check)
+        parts = None if self._has_drops else self._pipeline(scan, self._mounting, watch, check, earlier)
         health, self._normal = check(scan) if parts is None else parts.beside
         self._has_drops = health.has_drops
         if health.has_drops:
             scan, n_drops = without_drops(scan, profile, self._frame.eye)
             health, parts = replace(health, n_drops=n_drops), None
         watch.lap("check")
-        return scan, health, parts or self._pipeline(scan, self._mounting, watch)
+        return scan, health, parts or self._pipeline(scan, self._mounting, watch, earlier=earlier)
 
     def _without_ground(self, reason: MountingError) -> findings.Finding | None:
         """What to say of a scan that does not show how the sensor is mounted, if no other scan has."""
@@ -721,18 +732,6 @@ class Perceiver:
             f"The ground suggests a {shown}, but it is too uneven to tell a tilt of the sensor from its own slope: "
             "the sensor is taken as level until scans of other places agree. If you know its tilt, pass mounting= "
             "(on the command line --roll, --pitch or --extrinsic)."
-        )
-
-    def _about_given_tilt(self, shown: Mounting | None) -> findings.Finding | None:
-        """What to say if the ground shows another tilt than was given, as where a sign is wrong."""
-        if shown is None:
-            return None
-        used = self._mounting
-        return findings.Finding(
-            f"The ground shows a roll of {shown.roll_deg:.1f} and a pitch of {shown.pitch_deg:.1f} deg, and the "
-            f"mounting has {used.roll_deg:.1f} and {used.pitch_deg:.1f}: roll is positive if the left side is up, "
-            "pitch if x points down. Correct them (mounting=, --roll, --pitch, --extrinsic), or leave them out to have "
-            "them found. If the vehicle stands before a ramp, ignore this."
         )
 
     def _refuse(self, fitness: tuple[findings.Finding, ...]) -> None:

@@ -192,13 +192,19 @@ class Pipeline:
         self.sectors = sectors_of_turn(ranged[0].view) if ranged and options.full_turn else []
         # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms.
         views = [network.view for network in (top, *ranged[:1]) if network is not None]
-        self.crop = Crop([] if options.full_turn else views)
+        self.crop, self._crop_gathered = (Crop([] if options.full_turn else views) for _ in range(2))
 
     def __call__(
-        self, points: Points, mounting: Mounting, watch: Stopwatch, beside: Callable[[Points], object] | None = None
+        self,
+        points: Points,
+        mounting: Mounting,
+        watch: Stopwatch,
+        beside: Callable[[Points], object] | None = None,
+        earlier: Points | None = None,
     ) -> Parts:
         """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN; ``beside`` is computed
-        of them when a lane has nothing else to do.
+        of them when a lane has nothing else to do. Ground and objects are found with ``earlier`` points of the same
+        frame, too, if there are any.
         """
         top, options, rules, per_m = self.top, self.options, self.options.rules, self.options.distance_per_m
 
@@ -206,11 +212,12 @@ class Pipeline:
         value = Values(watch)
         absent, nothing = value("check", _absent), value("check", tuple)
         near = value("project", self._select, points)
-        planes = scan = surface = cells = labels = places = absent
+        planes = scan = gathered = surface = cells = labels = places = absent
         boxes = detected = detections = objects = nothing
         if self.needs_ground:
-            planes = value("cluster", _fit_ground, points, mounting)
+            planes = value("cluster", _fit_ground, points, earlier, mounting)
             scan = value("cluster", _on_ground, near, planes)
+            gathered = scan if earlier is None else value("cluster", self._gathered, planes)
             surface = value("cluster", GroundFit.surface, planes)
 
         # The top view (SSADNet)
@@ -219,7 +226,7 @@ class Pipeline:
             detected = value("infer", top.find_boxes, projected, self._least_score, options.network_score)
             boxes = value("decode", _at_least, detected, options.network_score)
         if self.objects is not None:
-            places = value("cluster", self.objects.cluster, scan, options.boxes_from, per_m)
+            places = value("cluster", self.objects.cluster, gathered, options.boxes_from, per_m)
 
         # The range image (PointSeg), once or for each sector of a turn
         free = deque(self.ranged)  # of this call: an interrupt would lose one that a lane has taken
@@ -235,8 +242,8 @@ class Pipeline:
         if self.objects is not None:
             detected = detected if options.boxes_from != "clusters" else nothing
             shown = [nothing] * (PARTS - 1) + [detected]
-            looks = [value("infer", self.objects.look, k, scan, places, shown[k]) for k in range(PARTS)]
-            objects = value("infer", self.objects.find_boxes, scan, places, detected, options.object_score, *looks)
+            looks = [value("infer", self.objects.look, k, gathered, places, shown[k]) for k in range(PARTS)]
+            objects = value("infer", self.objects.find_boxes, gathered, places, detected, options.object_score, *looks)
 
         # Objects alone: classes such as road and building are background to the stages below
         seen, labels = labels, value("refine", self.ranged[0].objects_of, labels) if self.ranged else absent
@@ -265,7 +272,7 @@ class Pipeline:
             standing = value("agree", stand_boxes, joined, scan, agreed, rules, per_m)
         if self.objects is not None:
             labeled, score = bool(self.ranged) and options.boxes_from != "network", options.cluster_score
-            standing = value("infer", self.objects.complete, scan, places, objects, standing, labeled, score)
+            standing = value("infer", self.objects.complete, gathered, places, objects, standing, labeled, score)
         if detector is not None:
             standing = value("cluster", _detected, detections, standing, detector, options.cluster_score)
         if "ceiling" in rules:
@@ -282,6 +289,9 @@ class Pipeline:
 
     def _select(self, points: Points) -> View:
         return View(*self.crop.select(points))
+
+    def _gathered(self, planes: GroundFit) -> Scan:
+        return _on_ground(View(*self._crop_gathered.select(planes.points)), planes)
 
     def _label_ahead(self, near: View, scan: Scan | None, watch: Stopwatch) -> PointLabels:
         return self.ranged[0].label(near.points, None if scan is None else scan.ground.height_m, watch)
@@ -352,13 +362,18 @@ def _at_least(boxes: Sequence[Box], min_score: float) -> list[Box]:
     return [box for box in boxes if box.score >= min_score]
 
 
-def _fit_ground(points: Points, mounting: Mounting) -> GroundFit:
+def _fit_ground(points: Points, earlier: Points | None, mounting: Mounting) -> GroundFit:
     reach_m = max(FIRST_REACH_M, FIRST_REACH_HEIGHTS * (mounting.height_m or 0.0))
-    return fit_ground(points, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
+    every = points if earlier is None else np.concatenate([points, earlier])
+    return fit_ground(every, mount_height_m=MODEL_HEIGHT_M, reach_m=reach_m)
 
 
 def _on_ground(near: View, planes: GroundFit) -> Scan:
-    return Scan.of(near.points, planes.heights(near.rows))
+    """The points of a view, which are the first ones of the fit unless it says which."""
+    rows = near.rows
+    if rows is None and len(near.points) < len(planes.points):
+        rows = np.arange(len(near.points), dtype=np.int32)
+    return Scan.of(near.points, planes.heights(rows))
 
 
 def _sorted(scan: Scan, distance_per_m: float) -> Strips:

@@ -60,6 +60,7 @@ FLOORS = {
         tracking.smoothing
         tracking.__init__
         tracking.moving tracking.zones
+        tracking.sweeps
         zoo.__init__
         agreement.__init__ agreement.votes
         agreement.rules
@@ -74,7 +75,7 @@ FLOORS = {
         road.ahead road.grid
         road.rolling
         pipeline
-        readers.__init__ readers.origin readers.pcap readers.ports readers.times readers.unknown
+        readers.__init__ readers.origin readers.pcap readers.ports readers.scan_odometry readers.times readers.unknown
         readers.clouds readers.images readers.ouster readers.packets readers.tables
         readers.alternation readers.livox_packets readers.mems_packets readers.ouster_packets readers.spinning_packets
         readers.inflate readers.mirror_packets readers.pcd readers.ply readers.raw readers.senders

@@ -42,7 +42,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc import Box, Perceiver, Perception, Tracker, Tracks, movable_points, moving_points, smooth_tracks
+from edgeperc import Box, Odometry, Perceiver, Perception, Tracker, Tracks, movable_points, moving_points, smooth_tracks
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import SplitError
 from edgeperc.evaluation.judge import check_unseen, training_scans_of
@@ -68,7 +68,7 @@ MOVING_AROUND = 10  # scans around one in which an object moves for which it cou
 GROUND_M = 0.2  # points so near to the bottom of a label may be of the ground
 
 Poses = Floats
-Odometry = Callable[[Sequence[Points]], Poses]
+Localize = Callable[[Sequence[Points]], Poses]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def step_errors(true: Poses, found: Poses) -> Floats:
     return np.asarray(np.linalg.norm(a - b, axis=1))
 
 
-def closure(odometry: Odometry, scans: Sequence[Points]) -> tuple[Poses, float]:
+def closure(odometry: Localize, scans: Sequence[Points]) -> tuple[Poses, float]:
     """Poses of two scans or more, and how far from the pose of the second one it is after the way back [m]."""
     poses = odometry([*scans, *scans[-2::-1]])
     return poses[: len(scans)], float(math.dist(poses[1][:3, 3], poses[-2][:3, 3]))
@@ -179,15 +179,8 @@ def ghost_share(scans: Sequence[Points], kept: Sequence[Mask], moving: Sequence[
 
 def kiss_icp(scans: Sequence[Points]) -> Poses:
     """Poses (k, 4, 4) of KISS-ICP, the first one at the origin."""
-    module, config = require("kiss_icp.kiss_icp", "slam", "KISS-ICP"), require("kiss_icp.config", "slam", "KISS-ICP")
-    settings = config.load_config(None)
-    settings.data.deskew = False
-    settings.registration.max_num_threads = 1
-    odometry, poses = module.KissICP(settings), []
-    for points in scans:
-        odometry.register_frame(points[:, :3].astype(np.float64), np.zeros(0))
-        poses.append(odometry.last_pose)
-    return np.array(poses)
+    odometry = Odometry()
+    return np.array([odometry(points) for points in scans])
 
 
 @dataclass(frozen=True)
@@ -220,7 +213,7 @@ def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
 
 
 def compared(
-    drive: Drive, seen: Seen, odometry: Odometry, *, second_pass: bool = False
+    drive: Drive, seen: Seen, odometry: Localize, *, second_pass: bool = False
 ) -> tuple[list[list[str]], list[str]]:
     """The rows of a drive in the table, one for each variant; the row of its motion in the second table."""
     rows, moving, first = [], drive.moving, None
@@ -280,7 +273,7 @@ def on_objects(points: Points, boxes: Sequence[Box]) -> Mask:
     return is_object
 
 
-def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
+def draw_maps(drive: Drive, seen: Seen, odometry: Localize, path: Path) -> None:
     """Draw the maps from above; points of objects that truly move are red."""
     pyplot = require("matplotlib.pyplot", "view", "Drawing a picture")
     figure, axes = pyplot.subplots(3, 1, figsize=(9.0, 8.2), dpi=100, sharex=True, sharey=True)

@@ -29,6 +29,7 @@ from .arguments import (
     file_options,
     keywords,
     options,
+    positive,
     positive_number,
 )
 from .output import make_folder, make_places, print_error, print_line, progress
@@ -61,13 +62,15 @@ from .side_by_side import (
 from .sinks import Sinks, add_sinks, wanted_sinks
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..preprocess.motion import Trajectory
     from ..tracking.tracks import Tracks
     from ..types.mounting import Mounting
     from ..types.perception import Perception
-    from ..types.points import Floats, Points
+    from ..types.points import Points
     from ..types.sensor import SensorProfile
 
 
@@ -176,6 +179,13 @@ def add_parser(commands: Commands) -> None:
         "--track",
         "track the boxes from scan to scan, in their order; each folder of scan files is a drive. Late scans have no "
         "tracks, and after a jump of the clock, or for another drive, tracking begins anew",
+    )
+    tracking(
+        "--sweeps N",
+        "find objects and the ground with the points of the last N scans, 2 to 20, on what stands still: for sensors "
+        "of few beams. Needs --track. The sensor moves as --poses say, else as KISS-ICP finds (extra 'slam') "
+        "(default: each scan alone)",
+        type=positive,
     )
     tracking("--gif", "write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'")
     live = options(parser, "live")
@@ -316,6 +326,13 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--gif needs --track")
     if arguments.consistency is not None and (arguments.live or not arguments.track):
         arguments.usage_error("--consistency needs --track, and no --live: it is of a whole drive")
+    if arguments.sweeps is not None:
+        if arguments.live or arguments.scan or not arguments.track:
+            arguments.usage_error("--sweeps needs --track, and no --live or --scan")
+        if not 2 <= arguments.sweeps <= 20:
+            arguments.usage_error(f"--sweeps is {arguments.sweeps}; expected 2 to 20 scans")
+        if arguments.poses is None:
+            require("kiss_icp", "slam", "--sweeps without --poses", package="kiss-icp")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
     if arguments.poses is not None and not arguments.deskew:
@@ -452,10 +469,17 @@ class _Run:
         self._arguments, self._perceivers, self._kinds, self._sinks = arguments, perceivers, kinds, sinks
         self._tracker = Tracker() if arguments.track else None
         self._straightener = None
+        self._sweeps = self._odometry = None
         if arguments.deskew:
             from .straighten import Straightener
 
             self._straightener = Straightener(_trajectory(arguments))
+        if arguments.sweeps is not None:
+            from ..readers.scan_odometry import Odometry
+            from ..tracking.sweeps import Sweeps
+
+            self._sweeps = Sweeps(arguments.sweeps)
+            self._odometry = Odometry() if arguments.poses is None else None
         self._n = 0
         self._folder: Path | Remote | None = None
         self._n_before = 0  # scans, where the folder began
@@ -491,11 +515,14 @@ class _Run:
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    perception = perceive(points, stamp_s, origin_m=how["origin_m"])
+                    pose, earlier = self._pose(points, how["origin_m"]), None
+                    if self._sweeps is not None and pose is not None:
+                        earlier = self._sweeps.earlier(points, at_s, pose)
+                    perception = perceive(points, stamp_s, origin_m=how["origin_m"], earlier=earlier)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
                     wanted = files_of(self._arguments, file, self._kinds, False)
-                    yield self._answered(name, points, perception, perceive.sensor, wanted, at_s)
+                    yield self._answered(name, points, perception, perceive.sensor, wanted, at_s, pose)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
                 except MemoryError:
@@ -518,6 +545,8 @@ class _Run:
                 stacklevel=2,
             )
             self._n += math.ceil(_BETWEEN_DRIVES_S * self._arguments.rate)
+            if self._odometry is not None:
+                self._odometry.reset()
         self._folder, self._n_before = folder, self._n
 
     def _origin(self, scan: Path) -> Sequence[float] | None:
@@ -553,7 +582,8 @@ class _Run:
                 calib = calibration_of(arguments.calib, str(scan))
                 calibration = Calibration.from_kitti(calib, image.shape[1], image.shape[0])
                 view.draw_painted(perception, image, points, calibration, wanted.pop("both"), title=path.name)
-            yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, scan)
+            pose = self._pose(points, origin)
+            yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, pose, scan)
         except (EdgepercError, OSError) as exc:
             yield path, exc, None, None
         except MemoryError:
@@ -596,6 +626,7 @@ class _Run:
         sensor: SensorProfile,
         wanted: Mapping[str, Path],
         stamp_s: float,
+        pose: ArrayLike | None,
         scan: Path | None = None,
     ) -> Outcome:
         """Track the boxes and write everything about a scan; ``scan`` is its file if ``name`` is its image."""
@@ -604,10 +635,11 @@ class _Run:
         source = str(scan or name)
         tracks = None
         if self._tracker is not None:
-            pose = self._pose(perception)
             tracks = self._tracker.update(perception.boxes, stamp_s, pose, mounting=perception.mounting)
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
+        if self._sweeps is not None and tracks is not None and (self._odometry is None or self._odometry.is_settled):
+            self._sweeps.add(points, perception, tracks)
         try:
             if "png" in wanted:
                 view.draw(perception, points, wanted["png"], title=source)
@@ -622,16 +654,16 @@ class _Run:
         under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
         return name, perception, tracks, under
 
-    def _pose(self, perception: Perception) -> Floats | list[list[float]] | None:
-        """Pose of the sensor, seen from that of the first scan: by ``--poses``, or where its place in a map is known,
-        whose axes are then its own.
+    def _pose(self, points: Points, origin_m: Sequence[float] | None) -> ArrayLike | None:
+        """Pose of the sensor, seen from that of the first scan: by ``--poses``, where its place in a map is known,
+        whose axes are then its own, or for ``--sweeps`` by an odometry.
         """
         if self._straightener is not None and self._straightener.pose is not None:
             return self._straightener.pose
-        if perception.origin_m is None:
-            return None
-        self._first_place = self._first_place or perception.origin_m
-        x, y, z = (a - b for a, b in zip(perception.origin_m, self._first_place, strict=True))
+        if origin_m is None:
+            return None if self._odometry is None else self._odometry(points)
+        self._first_place = self._first_place or (origin_m[0], origin_m[1], origin_m[2])
+        x, y, z = (a - b for a, b in zip(origin_m, self._first_place, strict=True))
         return [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]]
 
     def _at_s(self, stamp_s: float | None) -> float:

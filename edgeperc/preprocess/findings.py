@@ -462,6 +462,18 @@ def about_lying(mounting: Mounting) -> Finding | None:
     )
 
 
+def about_given_tilt(given: Mounting, shown: Mounting | None) -> Finding | None:
+    """What to say if the ground shows another tilt than was given, as where a sign is wrong."""
+    if shown is None:
+        return None
+    return Finding(
+        f"The ground shows a roll of {shown.roll_deg:.1f} and a pitch of {shown.pitch_deg:.1f} deg, and the mounting "
+        f"has {given.roll_deg:.1f} and {given.pitch_deg:.1f}: roll is positive if the left side is up, pitch if x "
+        "points down. Correct them (mounting=, --roll, --pitch, --extrinsic), or leave them out to have them found. "
+        "If the vehicle stands before a ramp, ignore this."
+    )
+
+
 def _other_height(scan: Measures, profile: FitnessProfile) -> Finding | None:
     if scan.ground_m is None or profile.ground_m is None:
         return None

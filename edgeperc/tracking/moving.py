@@ -16,12 +16,13 @@ from ..types.perception import Box, Perception, scan_of
 from ..types.points import Floats, Mask, Points, as_points, read_only
 from . import Track
 
+PEOPLE = frozenset({"pedestrian", "person", "person_sitting", "cyclist", "bicyclist", "motorcyclist"})
 MOVABLE = frozenset(
     {
         *VEHICLES,
         *("bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
         *("construction_vehicle", "emergency_vehicle", "other_vehicle", "other-vehicle", "on-rails"),  # of data sets
-        *("pedestrian", "person", "person_sitting", "cyclist", "bicyclist", "motorcyclist"),
+        *PEOPLE,
     }
 )
 """Classes of points and boxes that can move on their own or are moved by people."""
@@ -86,7 +87,7 @@ def moving_points(
         ``points`` is not a scan.
     """
     moving = moving_tracks(tracks, min_speed_mps=min_speed_mps, n_sigmas=n_sigmas)
-    return _inside_any([track.box for track in moving], as_points(points), margin_m)
+    return inside_boxes([track.box for track in moving], as_points(points), margin_m)
 
 
 def movable_points(
@@ -118,14 +119,15 @@ def movable_points(
         ``points`` is not the scan of the perception.
     """
     scan, classes = scan_of(perception, points), as_classes(classes)
-    found = _inside_any([box for box in perception.boxes if box.label in classes], scan, margin_m)
+    found = inside_boxes([box for box in perception.boxes if box.label in classes], scan, margin_m)
     if perception.points is not None:
         numbers = [k for k, name in enumerate(perception.points.classes) if name in classes]
         found |= np.isin(perception.points.labels, numbers) & perception.points.in_view
     return found
 
 
-def _inside_any(boxes: list[Box], points: Points, margin_m: float) -> Mask:
+def inside_boxes(boxes: list[Box], points: Points, margin_m: float) -> Mask:
+    """Mark the points (n, 3 or 4) inside at least one box, grown by a margin on every side."""
     margin_m = OPTIONS.number("margin_m", margin_m, 0.0)
     rows = [
         (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
