@@ -192,7 +192,7 @@ def add_parser(commands: Commands) -> None:
     live(
         "--live",
         "replay one PATH in real time; always take the newest scan and drop older ones that still wait (default for "
-        "ports, if no files are written)",
+        "ports, without files of each scan, --gif, --deskew and --consistency)",
     )
     live("--rate HZ", "scans per second of files without time stamps (default: 10)", type=positive_number, default=10.0)
 
@@ -232,7 +232,8 @@ def run_command(arguments: argparse.Namespace) -> int:
 
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     # What comes at a port is a live source, unless every scan is wanted.
-    arguments.live |= any(map(is_port, arguments.paths)) and not (kinds or arguments.gif or arguments.deskew)
+    wants_all = kinds or arguments.gif or arguments.deskew or arguments.consistency is not None
+    arguments.live |= any(map(is_port, arguments.paths)) and not wants_all
     _check_usage(arguments, kinds)
     images = _images(arguments, kinds)
     given = [*images] or ([_live_source(arguments)] if arguments.live else [])
@@ -288,7 +289,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         try:
             under, mountings = zip(*report.under, strict=True)
             draw_tracks(report.tracks, gif, under=under, mountings=mountings)
-        except OSError as exc:
+        except (EdgepercError, OSError) as exc:
             n_failed += 1
             print_error(f"{gif}: {exc}")
     n_perceived = report.n - len(found.empty)
@@ -613,10 +614,9 @@ class _Run:
                 scan = PerceivedScan(str(name), answer.stamp_s, *of_scan, perceiver.sensor, answer.health)
                 try:
                     self._sinks.write(scan)
-                except (EdgepercError, OSError) as exc:
-                    yield name, exc, None, None
-                else:
-                    yield name, answer, answer.tracks, None
+                except (EdgepercError, OSError) as exc:  # a full disk costs nobody who listens the answer
+                    self._sinks.failed(f"{name}: ", exc)
+                yield name, answer, answer.tracks, None
 
     def _answered(
         self,

@@ -85,13 +85,14 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 
 class Sinks:
     """The sinks of the passed options, made before the first scan: each gets every scan and is closed, whatever becomes
-    of the others. ``n_failed`` counts files that could not be finished.
+    of the others. ``n_failed`` counts what could not be written: a live answer, or the end of a file.
     """
 
     def __init__(self, arguments: argparse.Namespace, *, of_ports: bool = False) -> None:
         self.n_failed = 0
         self._is_live: bool = arguments.live or of_ports
         self._is_whole = True
+        self._told = set[str]()
         self._sinks: list[Sink] = []
         self._stack = ExitStack()
         try:
@@ -158,5 +159,11 @@ class Sinks:
         try:
             sink.close(self._is_whole)
         except (EdgepercError, OSError) as exc:
-            self.n_failed += 1
-            print_error(str(exc))
+            self.failed("", exc)
+
+    def failed(self, where: str, error: Exception) -> None:
+        """Count what could not be written, and say so; the same error of a live run's answers once."""
+        self.n_failed += 1
+        if str(error) not in self._told:
+            self._told.add(str(error))
+            print_error(f"{where}{error}")

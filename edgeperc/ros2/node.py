@@ -130,7 +130,7 @@ class PerceptionNode:
         self._stamp_ns: int | None = None
         self._points: Floats32 | None = None
         self._n_earlier = 0  # of these points: those of clouds before the newest
-        self._gather_s: float | None = None  # time over which scans are gathered; None: not known yet, 0: not at all
+        self._gather_s = 0.0  # time over which scans are gathered, of a sensor that is known not to spin
         self._recent: deque[tuple[int, bytes]] = deque(maxlen=_MOST_GATHERED)  # when they came [ns]
         self._newest: PerceivedScan | None = None
         self._n_failed = self._n_unplaced = 0
@@ -199,6 +199,8 @@ class PerceptionNode:
                 self._connect()
             elif transition == "cleanup":
                 self._perceiver, self._newest, self._error, self._forgets = None, None, None, True
+                self._gather_s = 0.0
+                self._recent.clear()
             self._state = possible[transition]
             if transition == "shutdown":
                 self._waiting.put(None)
@@ -222,7 +224,7 @@ class PerceptionNode:
 
     def _receive(self, data: bytes) -> None:
         if self._state == "active":
-            if self._gather_s != 0.0:
+            if self._gather_s:
                 self._recent.append((time.time_ns(), data))
             self._waiting.put(data)
 
@@ -293,8 +295,9 @@ class PerceptionNode:
         if perceiver is None:
             perceiver = self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
             self._cloud_frame = cloud.header.frame_id
-            pattern = perceiver.sensor.pattern
-            self._gather_s = 0.0 if pattern is None else pattern.accumulate_s
+            if (pattern := perceiver.sensor.pattern) is not None:
+                self._recent.append((time.time_ns(), data))
+                self._gather_s = pattern.accumulate_s
         if cloud.header.frame_id != self._cloud_frame:
             raise PointsError(
                 f"the cloud has the frame {cloud.header.frame_id!r}, and the first one {self._cloud_frame!r}: it is of "

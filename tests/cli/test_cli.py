@@ -533,6 +533,11 @@ def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, shell: Shell) -> N
     (answer,) = shell.records("run", tmp_path, "--live", code=1)
     assert answer == {"scan": str(tmp_path), "error": "pointseg answered with NaN"}
     assert "there is no such file or folder" in shell.err("run", tmp_path / "absent", "--live")
+    scan = write_scan(tmp_path / "drive" / "b.bin", 10)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "b.bin").write_bytes(b"by hand")
+    (answer,) = shell.records("run", scan, "--live", "--movable", "--static", tmp_path / "kept", code=1)
+    assert answer["n_points"] == 10
 
 
 @pytest.mark.usefixtures("matplotlib", "foreground")
@@ -547,13 +552,18 @@ def test_files_are_written(tmp_path: Path, shell: Shell, monkeypatch: pytest.Mon
     assert b"element vertex 40\n" in (out / "000123.ply").read_bytes()
     assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
     assert answer["n_points"] == 40
-    sent = [*captures.read_scans(scan), *captures.read_scans(scan), None]
+    (one,) = captures.read_scans(scan)
+    sent = [one, None]
     monkeypatch.setattr(
         captures, "read_scans", lambda *_, **__: (each or signal.raise_signal(signal.SIGINT) for each in sent)
     )
     monkeypatch.setattr(captures, "known_sensor", lambda *_: None)
-    given = ["--sensor", "hdl-64e", "--track", "--gif", "--out", tmp_path, "--play", out / "play.html"]
-    shell.both("run", "udp:2368", *given, code=130)
+    given = ["--sensor", "hdl-64e", "--track", "--play", out / "play.html", "--consistency", out / "figures.json"]
+    gif = ["--gif", "--out", tmp_path]
+    for n_scans, option in ((1, gif), (2, gif), (3, [])):
+        shell.both("run", "udp:2368", *given, *option, code=130)
+        assert json.loads((out / "figures.json").read_text())["n_scans"] == n_scans
+        sent.insert(0, one)
     assert (tmp_path / "tracks.gif").exists()
     assert (out / "play.html").exists()
 

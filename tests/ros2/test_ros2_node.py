@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -300,6 +301,18 @@ def test_clouds_of_a_sensor_that_does_not_spin_are_gathered(gather_s: float, sta
     np.testing.assert_array_equal(outcomes[2].points[-6:], np.concatenate([POINTS + 1, POINTS + 2]))
     parts = [MESSAGES.decode(data, CLOUD) for data in graph.published["/edgeperc/ground_points"]]
     assert all(part.width <= len(POINTS) for part in parts)
+
+
+def test_clouds_of_a_sensor_that_spins_are_not_kept() -> None:
+    """Those that came while the perceiver was made were, for the node's life: a gigabyte."""
+    first, second = cloud(POINTS), cloud(POINTS, 2 * 10**9)
+    n_references = sys.getrefcount(first)
+    with running() as (graph, _, outcomes):
+        for each in (first, second, second):
+            graph.give(each)
+            next(outcomes)
+        del each
+        assert sys.getrefcount(first) == n_references
 
 
 def test_a_cloud_of_another_frame_is_an_error_and_the_first_sensor_goes_on() -> None:
