@@ -41,7 +41,7 @@ class Relay:
             self._loop.call_soon_threadsafe(self._end, grace_s)
 
     def close(self) -> None:
-        """End all connections."""
+        """End all connections, now or when those that `end` gave time have had it."""
         self.end(0.0)
         self._thread.join()
 
@@ -57,6 +57,8 @@ class Relay:
             await asyncio.wait([*self.viewers])
 
     def _end(self, grace_s: float) -> None:
+        if self._ending.is_set():  # viewers keep the time that they were given
+            return
         self._ending.set()
         self._loop.remove_reader(self._listener)
         self._listener.close()

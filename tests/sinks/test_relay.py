@@ -147,11 +147,18 @@ def test_a_viewer_that_sends_without_end_is_dropped(relayed: Opener, monkeypatch
 
 
 @pytest.mark.parametrize("answer", [echo, flood])
-def test_a_relay_closes_with_viewers_connected(relayed: Opener, answer: Callable[[socket.socket], None]) -> None:
+def test_a_relay_closes_with_viewers_connected(
+    relayed: Opener, answer: Callable[[socket.socket], None], caplog: pytest.LogCaptureFixture
+) -> None:
     relay, connect = relayed(answer)
     viewers = [connect() for _ in range(3)]
+    for viewer in viewers:
+        viewer.sendall(b"hello")
+        assert viewer.recv(5)
+    relay.end(0.1)
     assert returns(relay.close, PATIENCE_S)
     assert all(map(has_ended, viewers))
+    assert not caplog.records  # a callback's error is only logged
     relay.close()  # again, without effect
     with pytest.raises(ConnectionError):
         connect()
