@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import OptionError, SensorError
 from ..types.choices import AUTO_SENSOR
-from .arguments import Commands, add_command, add_mounting, add_networks, keywords, options, positive, positive_number
+from .arguments import (
+    Commands,
+    add_command,
+    add_mounting,
+    add_networks,
+    chosen_models,
+    keywords,
+    options,
+    positive,
+    positive_number,
+)
 from .output import many, print_error, print_line
 from .run import make_perceiver
 from .scans import check_sensor, with_mounting
@@ -123,10 +133,14 @@ def ros2_command(arguments: argparse.Namespace) -> int:
     """Run the node until it is stopped."""
     from ..ros2.node import USUAL_OUTPUTS, PerceptionNode
     from ..tracking.tracker import Tracker
+    from ..zoo import resolve
 
     graph = _open_graph(arguments)
     try:
         _take_parameters(graph, arguments)
+        check_sensor(arguments)
+        for model in chosen_models(arguments):  # no cloud heals a wrong name, and the first may come late
+            resolve(model)
         made = [] if arguments.sensor is None else [_perceiver(arguments, arguments.sensor)]
 
         def perceiver_for(cloud: Mapping[str, Any]) -> Perceiver:
@@ -228,7 +242,6 @@ def _rolling(arguments: argparse.Namespace) -> Rolling | None:
 
 
 def _perceiver(arguments: argparse.Namespace, sensor: Any) -> Perceiver:
-    check_sensor(arguments)
     mounted = with_mounting(sensor, arguments)
     mismatch: Any = "warn" if arguments.anyway else "refuse"
     made = make_perceiver(arguments, sensor=mounted, on_mismatch=mismatch, adapt=arguments.adapt)

@@ -144,7 +144,8 @@ class PerceptionNode:
         self._forgets = False  # the next cloud begins anew
 
         self._topics = _topics_of(outputs, prefix, rolling is not None)
-        _check_distinct(topic, self._topics, graph.name.rpartition("/")[0])
+        received = [topic, *([] if rolling is None else [rolling.topic])]
+        _check_distinct([*received, *self._topics.values()], graph.name.rpartition("/")[0])
         self._outputs: dict[str, Output] = {}
         self._diagnostics = graph.advertise("/diagnostics", messages.DIAGNOSTICS) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
@@ -479,7 +480,7 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
         if "=" in text:
             full_name(topic)
         if name == messages.ROLLING and not with_rolling:
-            raise OptionError("the output rolling needs poses; pass rolling=, with a topic of nav_msgs/Odometry")
+            raise OptionError("the output rolling needs poses; pass rolling= or --odometry, with a topic of nav_msgs/Odometry")
         full = topic or f"{prefix.rstrip('/')}/{name}"
         if topics.setdefault(name, full) != full:
             raise OptionError(f"outputs has {name} with two topics, {topics[name]} and {full}; expected one")
@@ -489,11 +490,11 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
     return topics
 
 
-def _check_distinct(topic: str, outputs: Mapping[str, str], namespace: str) -> None:
-    """Refuse outputs on one topic, and one on that of the clouds: the node would answer itself. Raises OptionError."""
-    full = [name if name.startswith("/") else f"{namespace}/{name}" for name in (topic, *outputs.values())]
+def _check_distinct(topics: Sequence[str], namespace: str) -> None:
+    """Refuse two things on one topic: the node would answer itself, or wait for ever. Raises OptionError."""
+    full = [name if name.startswith("/") else f"{namespace}/{name}" for name in topics]
     if twice := sorted({name for name in full if full.count(name) > 1}):
         raise OptionError(
-            f"the clouds and the outputs share the topic {', '.join(twice)}; expected one for each: another prefix, or "
-            "NAME=TOPIC"
+            f"clouds, odometry and outputs share the topic {', '.join(twice)}; expected one for each: another prefix, "
+            "or NAME=TOPIC"
         )

@@ -466,6 +466,8 @@ def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkey
         ({"topic": "a topic"}, "rclpy does not subscribe to 'a topic'"),
         ({"topic": ""}, "rclpy does not subscribe to ''"),
         ({"prefix": ""}, "share the topic /points"),
+        ({"odometry": "/points"}, "share the topic /points"),
+        ({"model": ["nothing"]}, "no model is called 'nothing'"),
         ({"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}, "no such sensor"),
         ({"rate": 20}, "the parameter rate is not of type float"),
     ],
