@@ -480,7 +480,9 @@ def _topics_of(outputs: Sequence[str], prefix: str, with_rolling: bool) -> dict[
         if "=" in text:
             full_name(topic)
         if name == messages.ROLLING and not with_rolling:
-            raise OptionError("the output rolling needs poses; pass rolling= or --odometry, with a topic of nav_msgs/Odometry")
+            raise OptionError(
+                "the output rolling needs poses; pass rolling= or --odometry, with a topic of nav_msgs/Odometry"
+            )
         full = topic or f"{prefix.rstrip('/')}/{name}"
         if topics.setdefault(name, full) != full:
             raise OptionError(f"outputs has {name} with two topics, {topics[name]} and {full}; expected one")

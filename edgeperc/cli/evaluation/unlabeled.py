@@ -33,9 +33,10 @@ class ConsistencySink:
         """Write the figures; see `Sink.close`."""
         figures = self._consistency.figures()
         path = self._path if whole else part_of(self._path)
-        write_atomic(path, (json.dumps(figures, indent=1, allow_nan=False) + "\n").encode())
-        if not whole:
-            warn_of(path, self._path)
+        if figures["n_scans"]:  # a run without answers replaces no file
+            write_atomic(path, (json.dumps(figures, indent=1, allow_nan=False) + "\n").encode())
+            if not whole:
+                warn_of(path, self._path)
         rows = [
             ((label, band), row)
             for label, bands in figures["classes"].items()
