@@ -17,6 +17,7 @@ from cli_helpers import POINTSEG, Shell
 from edgeperc import Box, OptionError, Perception, PointsError, Tracker
 from edgeperc.cli.evaluation.unlabeled import ConsistencySink
 from edgeperc.evaluation.consistency import Consistency
+from edgeperc.records import PerceivedScan
 from edgeperc.types.frame import moved_boxes
 from edgeperc.types.sensor import get_sensor
 
@@ -154,10 +155,10 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.
     assert json.loads(file.read_text())["classes"]["car"]["15-30 m"]["detected"] == 0.6
     printed = shell.err("run", drive / "000000.bin", "--sensor", "hdl-64e", "--track", "--consistency", file, code=0)
     assert "consistency of 1 scan of 1 drive, without labels [%]: nothing was detected" in printed
-    (tmp_path / "cut.bin").write_bytes(b"123")
-    printed = shell.err("run", tmp_path / "cut.bin", "--sensor", "hdl-64e", "--track", "--consistency", file, code=1)
-    assert "consistency of 0 scans" in printed
+    (drive / "cut.bin").write_bytes(b"123")
+    shell.err("run", drive / "cut.bin", "--sensor", "hdl-64e", "--track", "--consistency", file, code=1)
     assert json.loads(file.read_text())["n_scans"] == 1  # those before stay
+    (drive / "cut.bin").unlink()
     monkeypatch.setattr("test_consistency.FIRST", 0)
     printed = shell.err("run", drive, "--sensor", "hdl-64e", "--track", "--consistency", file, code=0)
     assert "100.0" in printed
@@ -166,6 +167,8 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, monkeypatch: pytest.
         refused = "--consistency needs --track, and no --live"
         assert refused in shell.err("run", drive, *options, "--consistency", file)
     sink = ConsistencySink(tmp_path / "stopped.json")
+    perception = perceived(points_on(), 0.0)
+    sink.write(PerceivedScan("a.bin", 0.0, points_on(), perception, Tracker()(perception), get_sensor("hdl-64e")))
     with pytest.warns(RuntimeWarning, match="stopped.json"):
         sink.close(whole=False)
-    assert json.loads((tmp_path / "stopped.json.part").read_text())["n_scans"] == 0
+    assert json.loads((tmp_path / "stopped.json.part").read_text())["n_scans"] == 1
