@@ -49,7 +49,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
         ["tests/readers/test_bags.py", "tests/readers/test_times.py", "-k", "bag or mcap"],
     ),
     "ros2": (["rosbags", "zenoh"], ["tests/ros2/test_ros2_messages.py", "tests/ros2/test_ros2_node.py"]),
-    "slam": (["kiss_icp"], ["tests/bench/test_slam.py"]),
+    "slam": (["kiss_icp"], ["tests/bench/test_slam.py", "tests/readers/test_scan_odometry.py"]),
     "tensorboard": (["tensorboard", "torch"], ["tests/export/test_log.py"]),
     "velodyne": (
         ["velodyne_decoder"],

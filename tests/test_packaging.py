@@ -91,7 +91,7 @@ def test_groups_of_extras_name_every_other_one() -> None:
         return {extra}.union(*map(members, inner))
 
     apart = {"openvino", "gpu", "ouster"}  # other builds of onnxruntime; requirements that exclude those of rerun
-    makers = {"jit", "export", "tensorboard", "database", "loadgen", "peers", "geometry", "slam", "docs", "test"}
+    makers = {"jit", "export", "tensorboard", "database", "loadgen", "peers", "geometry", "docs", "test"}
     assert members("all") == extras.keys() - apart - makers
     table = (REPOSITORY / "docs/quickstart.md").read_text("utf-8")
     assert not [extra for extra in extras if f"`edgeperc[{extra}]`" not in table and f"`{extra}`" not in table]

@@ -183,8 +183,8 @@ def add_parser(commands: Commands) -> None:
     tracking(
         "--sweeps N",
         "find objects and the ground with the points of the last N scans, 2 to 20, on what stands still: for sensors "
-        "of few beams. Needs --track. The sensor moves as --poses say, else as KISS-ICP finds (extra 'slam') "
-        "(default: each scan alone)",
+        "of few beams. Needs --track. The sensor moves as --poses or --origin say, else as KISS-ICP finds (extra "
+        "'slam') (default: each scan alone)",
         type=positive,
     )
     tracking("--gif", "write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'")
@@ -332,7 +332,7 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
             arguments.usage_error("--sweeps needs --track, and no --live or --scan")
         if not 2 <= arguments.sweeps <= 20:
             arguments.usage_error(f"--sweeps is {arguments.sweeps}; expected 2 to 20 scans")
-        if arguments.poses is None:
+        if _needs_odometry(arguments):
             require("kiss_icp", "slam", "--sweeps without --poses", package="kiss-icp")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
@@ -480,7 +480,7 @@ class _Run:
             from ..tracking.sweeps import Sweeps
 
             self._sweeps = Sweeps(arguments.sweeps)
-            self._odometry = Odometry() if arguments.poses is None else None
+            self._odometry = Odometry() if _needs_odometry(arguments) else None
         self._n = 0
         self._folder: Path | Remote | None = None
         self._n_before = 0  # scans, where the folder began
@@ -670,6 +670,11 @@ class _Run:
         """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart, whether or not they fail."""
         self._n += 1
         return self._n / self._arguments.rate if stamp_s is None else stamp_s
+
+
+def _needs_odometry(arguments: argparse.Namespace) -> bool:
+    """Whether ``--sweeps`` has neither poses nor places of the scans in a map."""
+    return arguments.poses is None and arguments.origin is None
 
 
 def _trajectory(arguments: argparse.Namespace) -> Trajectory | None:

@@ -3,22 +3,29 @@
 Run as ``python -m edgeperc_export.release.thinned KITTI [--sensors vlp-16] [--models pointseg:int8 pointseg]``. Of the
 HDL-64E's beams, those nearest to the sensor's remain, with its columns; its range, noise and remission stay, and none
 looks up by more than 2 degrees. Prints a table of Markdown: of the network alone, and of the whole answer, with
-its boxes.
+its boxes. ``--drives 0001`` takes drives of successive scans instead, each alone and with the points of the last
+``--sweeps`` scans (`edgeperc.Sweeps`), at the poses that KISS-ICP finds in the thinned scans (extra ``slam``).
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from edgeperc import Odometry, Perceiver, Sweeps, Tracker
 from edgeperc.datasets.kitti import Frame, KittiObjects
 from edgeperc.evaluation.judge import BY_DEFAULT, NETWORK_ALONE, Judge
+from edgeperc.evaluation.kitti_ap import average_precisions, count_in_image
+from edgeperc.evaluation.metrics import Listed
 from edgeperc.evaluation.tables import figures
+from edgeperc.evaluation.truth import kitti_truth
 from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.types.choices import DEFAULT_SENSOR
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
@@ -53,6 +60,30 @@ def row_of(kitti: KittiObjects, model: str, sensor: str, whole: bool) -> str:
     return f"{name} | {points} | {' / '.join(cars) or '-'}"
 
 
+def row_of_drive(kitti: KittiObjects, drive: str, sensor: str, n: int) -> str:
+    """AP of cars and cyclists in a drive, R40 [%], by the last ``n`` scans; ``hdl-64e`` is not thinned."""
+    profile = get_sensor(sensor) if sensor == DEFAULT_SENSOR else profile_of(sensor)
+    perceive, tracker, counts = Perceiver(sensor=profile, on_mismatch="ignore"), Tracker(), Listed()
+    sweeps, odometry = (Sweeps(n), Odometry()) if n > 1 else (None, None)
+    for k, name in enumerate(name for name, of in kitti.drives.items() if of.endswith(drive)):
+        frame, stamp_s, pose, earlier = kitti.frame(name), 0.1 * k, None, None
+        points = frame.points if sensor == DEFAULT_SENSOR else thinned(frame, profile).points
+        if odometry is not None and sweeps is not None:
+            pose = odometry(points)
+            earlier = sweeps.earlier(points, stamp_s, pose)
+        perception = perceive(points, stamp_s, earlier=earlier)
+        tracks = tracker(perception, pose)
+        if odometry is not None and sweeps is not None and odometry.is_settled:
+            sweeps.add(points, perception, tracks)
+        front = kitti_truth(frame, None).front
+        if front is not None:
+            counts += count_in_image(front, perception.boxes, drive)
+    found = {rule: 100.0 * average_precisions(of)[0] for rule, of in counts.items()}
+    of_cars = [(measure, "moderate") for measure in ("bird's eye 0.5", "bird's eye 0.7", "3-D 0.7")]
+    cars = [f"{found['car', measure, part]:.1f}" for measure, part in (*of_cars, ("bird's eye 0.5", "30-45 m"))]
+    return f"{n} | {' / '.join(cars)} | {found['cyclist', '3-D 0.5', 'moderate']:.1f}"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         "edgeperc_export.release.thinned", description=(__doc__ or "").partition("\n\n")[0]
@@ -60,7 +91,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("kitti", metavar="KITTI", help="root of a KITTI object set")
     parser.add_argument("--sensors", nargs="*", default=[*SENSORS], metavar="NAME")
     parser.add_argument("--models", nargs="*", default=["pointseg:int8", "pointseg"], metavar="MODEL")
+    parser.add_argument("--drives", nargs="*", default=[], metavar="DRIVE")
+    parser.add_argument("--sweeps", nargs="*", type=int, default=[1, 5, 10], metavar="N")
     given = parser.parse_args(arguments)
+    if given.drives:
+        print(
+            "| drive | sensor | scans | AP of cars: bird's eye 0.5 / 0.7 / 3-D 0.7 / 30-45 m | of cyclists: 3-D 0.5 |"
+        )
+        print("|---|---|---|---|---|")
+        for drive, sensor, n in itertools.product(given.drives, given.sensors, given.sweeps):
+            print(f"| {drive} | {sensor} | {row_of_drive(KittiObjects(given.kitti), drive, sensor, n)} |", flush=True)
+        return
     print("| sensor | answer | network | IoU car / pedestrian / cyclist | AP of cars: bird's eye 0.5 / 0.7 / 3-D 0.7 |")
     print("|---|---|---|---|---|")
     for sensor in given.sensors:

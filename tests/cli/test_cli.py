@@ -48,6 +48,7 @@ class FakePerceiver:
     """Labels every second point a car; chokes where the first point's remission is 1."""
 
     made: ClassVar[list[FakePerceiver]] = []
+    n_earlier: ClassVar[list[int | None]] = []  # points that came with each scan
 
     def __init__(
         self,
@@ -78,7 +79,9 @@ class FakePerceiver:
         *,
         image: np.ndarray | None = None,
         origin_m: tuple[float, float, float] | None = None,
+        earlier: np.ndarray | None = None,
     ) -> Perception:
+        FakePerceiver.n_earlier.append(None if earlier is None else len(earlier))
         if len(points) and points[0, 3] == 1.0:
             raise InferenceError("pointseg answered\nwith NaN")
         if len(points) and points[0, 3] == 2.0:
@@ -645,6 +648,24 @@ def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     assert stamps_s[-5:] == pytest.approx([0.1, 0.3, 0.5, 100.6, 100.7])  # before them, those of a warm-up
 
 
+@pytest.mark.filterwarnings("default")
+def test_sweeps_come_with_the_next_scans(tmp_path: Path, shell: Shell) -> None:
+    """Where the place in a map is known, from the second scan on; by KISS-ICP from the fifth; never of another drive."""
+    for k in range(12):
+        (tmp_path / f"{k // 6}").mkdir(exist_ok=True)
+        write_scan(tmp_path / f"{k // 6}" / f"{k % 6}.bin")
+    FakePerceiver.n_earlier.clear()
+    shell.out("run", tmp_path / "0", "--track", "--sweeps", 3, "--origin", 0, 0, 0)
+    assert [bool(n) for n in FakePerceiver.n_earlier] == [False, True, True, True, True, True]
+    pytest.importorskip("kiss_icp", reason="the extra slam is not installed")
+    FakePerceiver.n_earlier.clear()
+    shell.out("run", tmp_path / "0", tmp_path / "1", "--track", "--sweeps", 3)
+    assert [bool(n) for n in FakePerceiver.n_earlier] == 2 * [*[False] * 4, True, True]
+    FakePerceiver.n_earlier.clear()
+    shell.out("run", tmp_path / "0", "--track")
+    assert FakePerceiver.n_earlier == [None] * 6
+
+
 def test_nothing_is_written_that_the_next_run_of_the_folder_would_read(tmp_path: Path, shell: Shell) -> None:
     """A second run perceived each scan twice: the .bin, and the .ply of the first run."""
     drive = tmp_path / "drive"
@@ -705,6 +726,9 @@ def test_wrong_usage(tmp_path: Path, shell: Shell, fake: type[FakePerceiver]) ->
         ((scan, "--live"), f"--live replays one path, got 2: {scan}, {scan}"),
         (("--deskew",), "--deskew needs --poses FILE or --track"),
         (("--poses", scan), "--poses needs --deskew"),
+        (("--sweeps", "5"), "--sweeps needs --track"),
+        (("--sweeps", "5", "--track", "--live"), "and no --live"),
+        (("--sweeps", "21", "--track"), "--sweeps is 21; expected 2 to 20"),
         (("--deskew", "--track", "--live"), "and no --live"),
     ]:
         assert words in shell.err("run", scan, *arguments)
