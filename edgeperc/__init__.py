@@ -60,9 +60,9 @@ if TYPE_CHECKING:
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
     from .road.rolling import RollingGrid
+    from .road.sweeps import Sweeps
     from .tracking import Track, Tracker, Tracks, smooth_tracks
     from .tracking.moving import movable_points, moving_points
-    from .tracking.sweeps import Sweeps
     from .tracking.zones import Crossing, Line, Zone
     from .types.card import ModelCard
     from .types.frame import ModelFrame
@@ -177,9 +177,9 @@ _NAMES = {
     "road.ahead": ("FreeAhead", "RoadAhead", "free_ahead", "road_ahead"),
     "road.grid": ("OccupancyGrid", "occupancy_grid"),
     "road.rolling": ("RollingGrid",),
+    "road.sweeps": ("Sweeps",),
     "tracking": ("Track", "Tracker", "Tracks", "smooth_tracks"),
     "tracking.moving": ("movable_points", "moving_points"),
-    "tracking.sweeps": ("Sweeps",),
     "tracking.zones": ("Crossing", "Line", "Zone"),
     "types.card": ("ModelCard",),
     "types.frame": ("ModelFrame",),

@@ -60,7 +60,6 @@ FLOORS = {
         tracking.smoothing
         tracking.__init__
         tracking.moving tracking.zones
-        tracking.sweeps
         zoo.__init__
         agreement.__init__ agreement.votes
         agreement.rules
@@ -73,7 +72,7 @@ FLOORS = {
         inference.object_network inference.pillar_network inference.sessions
         road.__init__ road.around road.outline
         road.ahead road.grid
-        road.rolling
+        road.rolling road.sweeps
         pipeline
         readers.__init__ readers.origin readers.pcap readers.ports readers.scan_odometry readers.times readers.unknown
         readers.clouds readers.images readers.ouster readers.packets readers.tables

@@ -477,7 +477,7 @@ class _Run:
             self._straightener = Straightener(_trajectory(arguments))
         if arguments.sweeps is not None:
             from ..readers.scan_odometry import Odometry
-            from ..tracking.sweeps import Sweeps
+            from ..road.sweeps import Sweeps
 
             self._sweeps = Sweeps(arguments.sweeps)
             self._odometry = Odometry() if _needs_odometry(arguments) else None

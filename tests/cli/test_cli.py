@@ -650,7 +650,7 @@ def test_a_scan_that_fails_takes_its_time(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.filterwarnings("default")
 def test_sweeps_come_with_the_next_scans(tmp_path: Path, shell: Shell) -> None:
-    """Where the place in a map is known, from the second scan on; by KISS-ICP from the fifth; never of another drive."""
+    """Where the place in a map is known, from the second scan on; by KISS-ICP from the fifth; none of another drive."""
     for k in range(12):
         (tmp_path / f"{k // 6}").mkdir(exist_ok=True)
         write_scan(tmp_path / f"{k // 6}" / f"{k % 6}.bin")

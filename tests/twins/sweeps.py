@@ -10,7 +10,7 @@ import numpy as np
 def still_there(
     scan: np.ndarray, earlier: np.ndarray, eye: np.ndarray, step: np.ndarray, beyond_m: float
 ) -> np.ndarray:
-    """Twin of `edgeperc.tracking.sweeps.mark_still_there`: looks through the beams of each direction one by one."""
+    """Twin of `edgeperc.road.sweeps.mark_still_there`: looks through the beams of each direction one by one."""
     n_columns = int(2.0 * math.pi / step[0])
 
     def place(point: np.ndarray) -> tuple[float, int, int] | None:

@@ -1,29 +1,32 @@
 """The last scans of a sensor as seen from its newest one: more points on what stands still.
 
 Detectors of nuScenes' scans perceive ten sweeps at once (Caesar et al., 2020). What moves would be smeared by it, so it
-is left out of the earlier scans: people, tracks that move, and places through which beams of the newest scan pass.
+is left out of the earlier scans: people, vehicles that may move, and places through which beams of the newest scan
+pass. An odometry of few beams misses how the sensor tilts, so the ground of each scan is laid on that of the newest.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
+from ..ground.planes import fit_ground, heights_above
 from ..system.clock import as_seconds
 from ..system.fields import OPTIONS
 from ..system.kernels import njit
-from ..types.frame import fill_moved
+from ..tracking import Track, Tracks
+from ..tracking.moving import PEOPLE, inside_boxes, movable_points
+from ..types.frame import OF_MODELS, ModelFrame, fill_moved
 from ..types.perception import Box, Perception, scan_of
 from ..types.points import Floats, Floats32, Mask, Points, as_points, read_only
 from ..types.rigid import rigid
 from ..types.sensor import SensorProfile
-from .moving import PEOPLE, inside_boxes, movable_points
-from .tracks import Track, Tracks
 
 MAX_SWEEPS = 20
 MAX_AGE_S = 3.0  # older scans are left out, as those before a pause or of another drive
@@ -33,12 +36,18 @@ NO_TRACK = -1
 COLUMN_RAD = math.radians(0.4)  # directions in which a beam tells what is there: two steps of most spinning sensors
 # How far behind a point a beam ends that passed it. The gap between beams is at least so large where there are many.
 BEYOND_M, LEAST_GAP_RAD = 0.6, math.radians(0.4)
+GROUND_STEP = 6  # one point in so many is looked at for the ground
+# Ground that counts: so near, and so near to that of the newest scan; at least so many points.
+GROUND_REACH_M, GROUND_OFF_M, LEAST_GROUND = 30.0, 0.7, 50
 
 
 class _Sweep(NamedTuple):
-    """A scan without people in the frame of the sensor at that time, and what may have moved in it, with its track."""
+    """A scan without people in the frame of the sensor at that time, some points of its ground, its tracks, and what
+    may have moved in it, with the track.
+    """
 
     points: Points
+    ground: Points
     tracks: Tracks
     boxes: list[tuple[Box, int]]
 
@@ -68,7 +77,7 @@ class Sweeps:
 
     def __init__(self, n: int = 5) -> None:
         self._sweeps = deque[_Sweep](maxlen=OPTIONS.whole("n", n, 2, MAX_SWEEPS) - 1)
-        self._gap_rad, self._eye = LEAST_GAP_RAD, np.zeros(2)
+        self._gap_rad, self._eye, self._frame = LEAST_GAP_RAD, np.zeros(2), OF_MODELS
         nothing = read_only(np.empty((0, 4), np.float32))
         self._still_there(nothing, nothing)  # compile here, not in the first call
 
@@ -86,9 +95,8 @@ class Sweeps:
         stamp_s : float
             Its time [s], on the clock of the tracked scans.
         T_world_sensor : (4, 4) array_like
-            Its rigid pose, in the world of the poses with which the earlier scans were tracked. It has to be right to a
-            few centimeters a scan, as those of an odometry are; a tracker's own estimate is not (see the how-to on
-            sensors).
+            Its rigid pose, in the world of the poses with which the earlier scans were tracked, as an odometry finds it
+            (`Odometry`). A tracker's own estimate is not exact enough.
 
         Returns
         -------
@@ -104,17 +112,15 @@ class Sweeps:
         if not math.isfinite(stamp_s):
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds")
         T_sensor_world = np.linalg.inv(rigid("T_world_sensor", T_world_sensor, TrackingError))
-        found = [np.empty((0, 4), np.float32)]
-        last = self._sweeps[-1].tracks if self._sweeps else ()
-        standing = {track.id for track in last if _stands(track)}
-        for sweep in self._sweeps:
-            if not 0.0 < stamp_s - sweep.tracks.stamp_s <= MAX_AGE_S:
-                continue
+        sweeps = [sweep for sweep in self._sweeps if 0.0 < stamp_s - sweep.tracks.stamp_s <= MAX_AGE_S]
+        if not sweeps:
+            return read_only(np.empty((0, 4), np.float32))
+        standing = {track.id for track in self._sweeps[-1].tracks if _stands(track)}
+        found = []
+        motions = [T_sensor_world @ sweep.tracks.T_world_sensor for sweep in sweeps]
+        for sweep, T in zip(sweeps, self._on_its_ground(scan, sweeps, motions), strict=True):
             boxes = [box for box, track in sweep.boxes if track not in standing]
-            then = sweep.points[~inside_boxes(boxes, sweep.points, MARGIN_M)]
-            T = T_sensor_world @ sweep.tracks.T_world_sensor
-            seen = np.empty(then.shape, np.float32)
-            fill_moved(read_only(then), T[:3, :3].copy(), T[:3, 3].copy(), seen)
+            seen = _moved(sweep.points[~inside_boxes(boxes, sweep.points, MARGIN_M)], T)
             found.append(seen[self._still_there(scan, seen)])
         return read_only(np.concatenate(found))
 
@@ -146,11 +152,26 @@ class Sweeps:
         left_out = movable_points(perception, scan, classes=PEOPLE, margin_m=MARGIN_M)
         found = [(track.box, track.id) for track in tracks]
         found += [(box, NO_TRACK) for k, box in enumerate(perception.boxes) if k not in tracks.sources]
+        self._frame, self._eye = ModelFrame(perception.mounting), np.array(perception.mounting.origin_m)
         if perception.sensor is not None:
             left_out |= _not_of_the_world(scan, perception.sensor, self._eye)
-            self._eye = np.array(perception.mounting.origin_m)
             self._gap_rad = max(LEAST_GAP_RAD, math.radians(perception.sensor.median_gap_deg))
-        self._sweeps.append(_Sweep(read_only(scan[~left_out & np.isfinite(scan[:, 0])]), tracks, found))
+        seen, some = scan[~left_out & np.isfinite(scan[:, 0])], scan[::GROUND_STEP]
+        ground = some[heights_above(perception.ground, self._frame.move(some)).mask]
+        self._sweeps.append(_Sweep(read_only(seen), ground, tracks, found))
+
+    def _on_its_ground(self, scan: Points, sweeps: Sequence[_Sweep], motions: Sequence[Floats]) -> list[Floats]:
+        """The motions (4, 4) of earlier scans, each turned and raised so that their ground lies on that of a scan."""
+        to_model = np.eye(4)
+        to_model[:3, :3], to_model[:3, 3] = self._frame.R, self._frame.t
+        moved = [_moved(sweep.ground, to_model @ T) for sweep, T in zip(sweeps, motions, strict=True)]
+        surface = fit_ground(self._frame.move(scan)).surface()
+        heights = heights_above(surface, read_only(np.concatenate(moved))).height_m
+        ends = np.cumsum([len(points) for points in moved])[:-1]
+        return [
+            np.linalg.inv(to_model) @ _leveling(points, height) @ to_model @ T
+            for points, height, T in zip(moved, np.split(heights, ends), motions, strict=True)
+        ]
 
     def _still_there(self, scan: Points, earlier: Points) -> Mask:
         """Which earlier points (n, 4) no beam of a scan contradicts, (n,)."""
@@ -158,6 +179,33 @@ class Sweeps:
         step = np.array([COLUMN_RAD, 0.5 * self._gap_rad])
         mark_still_there(read_only(scan), read_only(earlier), self._eye, step, BEYOND_M, is_there)
         return is_there
+
+
+def _moved(points: Points, T: Floats) -> Floats32:
+    moved = np.empty(points.shape, np.float32)
+    fill_moved(read_only(points), T[:3, :3].copy(), T[:3, 3].copy(), moved)
+    return moved
+
+
+def _leveling(ground: Points, height_m: Floats32) -> Floats:
+    """The small rotation about x and y and the shift along z (4, 4) that take heights off points of the ground: a plane
+    is fitted to them, three times, the last two without what is far from it.
+    """
+    near = np.hypot(ground[:, 0], ground[:, 1]) < GROUND_REACH_M
+    near &= np.abs(height_m) < GROUND_OFF_M  # False for NaN
+    leveling = np.eye(4)
+    if np.count_nonzero(near) < LEAST_GROUND:
+        return leveling
+    places = np.column_stack([ground[near, :2], np.ones(np.count_nonzero(near))]).astype(np.float64)
+    heights, kept = height_m[near].astype(np.float64), np.ones(len(places), np.bool_)
+    for _ in range(3):
+        a, b, c = np.linalg.lstsq(places[kept], heights[kept], rcond=None)[0].tolist()
+        off_m = np.abs(heights - places @ (a, b, c))
+        kept = off_m < max(3.7 * float(np.median(off_m[kept])), 0.03)  # 2.5 standard deviations
+    leveling[:3, :3] = [[1.0, 0.0, a], [0.0, 1.0, b], [-a, -b, 1.0]]
+    leveling[:3, :3] /= np.linalg.norm(leveling[:3, :3], axis=0)
+    leveling[2, 3] = -c
+    return leveling
 
 
 def _not_of_the_world(scan: Points, sensor: SensorProfile, eye: Floats) -> Mask:

@@ -28,8 +28,8 @@ from edgeperc import (
     TrackingError,
     Tracks,
 )
+from edgeperc.road.sweeps import mark_still_there
 from edgeperc.simulation import random_scene, simulate_sequence
-from edgeperc.tracking.sweeps import mark_still_there
 from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.sensor import get_sensor
 from scenes import assert_same, box, urban
@@ -130,6 +130,21 @@ def test_own_vehicle_rain_and_old_scans_are_left_out() -> None:
     assert len(sweeps.earlier(wall(10.0), 0.7, moved(0.0))) == 2 * len(wall(10.0))
     sweeps.reset()
     assert not len(sweeps.earlier(wall(10.0), 0.7, moved(0.0)))
+
+
+def test_the_ground_of_an_earlier_scan_lies_on_that_of_the_newest() -> None:
+    """Though its pose is tilted by half a degree and 0.1 m too high, as those of an odometry of few beams."""
+    wrong = np.eye(4)
+    wrong[:3, :3] = [[math.cos(0.01), 0.0, math.sin(0.01)], [0.0, 1.0, 0.0], [-math.sin(0.01), 0.0, math.cos(0.01)]]
+    wrong[2, 3] = 0.1
+    (_, first, earlier), (_, second, newest) = simulate_sequence(random_scene(5, "urban"), "vlp-16", 2, 10.0, 6.0)
+    found = []
+    for pose in (first, first @ wrong):
+        sweeps, tracker = Sweeps(), Tracker()
+        sweeps.add(earlier.points, perceived(earlier.points), tracker.update([], 0.0, pose))
+        found.append(sweeps.earlier(newest.points, 0.1, second))
+    np.testing.assert_allclose(found[1], found[0], atol=0.03)
+    assert len(found[0]) > 0.95 * len(earlier.points)
 
 
 def test_a_jump_of_the_clock_begins_anew() -> None:
