@@ -50,8 +50,12 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
     name = name if name in classes else COARSE.get(name, name)
     if name in classes:
         return classes.index(name)
-    whole = not any(part in classes for part in PARTS)
-    return 0 if name == BACKGROUND or (whole and name in PARTS) else IGNORE
+    return 0 if name == BACKGROUND or (name in PARTS and not tells_parts(classes)) else IGNORE
+
+
+def tells_parts(classes: Sequence[str]) -> bool:
+    """Whether classes tell parts of the background apart: of what is in no box, boxes then say nothing."""
+    return not set(PARTS).isdisjoint(classes)
 
 
 def numbers_of_scene(classes: Sequence[str] = POINT_CLASSES) -> Bytes:

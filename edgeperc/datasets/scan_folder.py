@@ -55,6 +55,7 @@ from .layout import (
     point_class_names,
     point_names_of,
     read_layout,
+    tells_parts,
 )
 from .trees import TREES, Tree
 
@@ -142,8 +143,8 @@ class ScanFrame:
         classes : sequence of str
             As in `class_number`.
         by : {"points", "boxes"} or None
-            Labels of points, or the class of the box around a point. None: of points if the scan has them, else by
-            boxes; all unknown if it has neither.
+            Labels of points, or the class of the box around a point, where beside boxes is background, unknown if
+            ``classes`` have parts of it. None: of points if the scan has them, else by boxes; all unknown without both.
 
         Raises
         ------
@@ -157,7 +158,7 @@ class ScanFrame:
             return np.array([class_number(name, classes) for name in self.class_names], np.uint8)[self.point_classes]
         if by != "boxes" or self.boxes is None:
             raise PointsError(f"scan {self.name} has no labels by {by}; expected points, or boxes, that it has")
-        labels = np.where(self.known_at(self.points), 0, IGNORE).astype(np.uint8)
+        labels = np.where(self.known_at(self.points) & (not tells_parts(classes)), 0, IGNORE).astype(np.uint8)
         # Ignored boxes first: a box of a rider alone lies in that of the cyclist.
         for box in sorted(self.boxes, key=lambda box: box.label != IGNORED):
             labels[inside(box, self.points, MARGIN_M)] = class_number(box.label, classes)

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
-from edgeperc.datasets.layout import numbers_of_scene
+from edgeperc.datasets.layout import numbers_of_scene, tells_parts
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
@@ -231,22 +231,21 @@ def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False, classes: Sequence[str] = ()
 ) -> Labeled:
     """Labeled scans of KITTI (``drawn``: with the hand-drawn roads), their weights, and their hashes by name."""
-    scans: list[LabeledScan] = []
-    weights: list[float] = []
-    hashes: dict[str, str] = {}
+    labeled = Labeled([], [], {})
     numbers = numbers_of_scene(classes or POINT_CLASSES)
+    numbers[0] = IGNORE if tells_parts(classes) else 0  # KITTI has boxes alone
     roads: dict[str, Bytes] = drawn_roads() if drawn else {}
     frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
     drives = [frame.drive for frame in frames]
     for frame in frames:
         scan = LabeledScan.from_frame(frame, sure_surface)
         scan = replace(scan, labels=numbers[scan.labels])
-        hashes[frame.name] = digest = scan_hash(frame.points)
+        labeled.hashes[frame.name] = digest = scan_hash(frame.points)
         if digest in roads:
             scan = replace(scan, surface=with_road(scan.surface, roads[digest]))
-        scans.append(scan)
+        labeled.scans.append(scan)
         # The weight of a drive is the square root of its number of frames, because neighboring frames look alike (a
         # drive has up to 154). A scan with a drawn road weighs as much as a drive with one frame, because its ground is
         # known everywhere.
-        weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
-    return Labeled(scans, weights, hashes)
+        labeled.weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
+    return labeled

@@ -517,6 +517,8 @@ def test_a_drawn_road_is_the_ground_truth_of_its_scan(kitti: Path, monkeypatch: 
     assert np.isin(truth, (0, 1, IGNORE)).mean() > 0.9
     assert (without == IGNORE).mean() > (truth == IGNORE).mean() + 0.1
     np.testing.assert_array_equal(other.surface, real_scans(objects, ["000001"])[0][0].surface)
+    assert 0 in scan.labels
+    assert 0 not in real_scans(objects, ["000000"], classes=("background", "car", "road"))[0][0].labels  # perhaps road
     # Outside the drawing, the certain cells of the scan remain.
     np.testing.assert_array_equal(scan.surface[:20], plain.surface[:20])
 
