@@ -226,9 +226,10 @@ def _is_kitti(root: Path) -> bool:
 def _folder(dataset: str | Path) -> ScanFolder | None:
     """The labeled scans of any sensor of a dataset; None if it is of another kind."""
     root, (kind, colon, _) = Path(dataset), str(dataset).partition(":")
-    if kind == "simulation" or _is_kitti(root) or any(root.glob("sequences/*/labels")):
+    is_described = (root / "scans.json").is_file()
+    if kind == "simulation" or (not is_described and (_is_kitti(root) or any(root.glob("sequences/*/labels")))):
         return None
-    if not colon and not (root / "scans.json").is_file():
+    if not colon and not is_described:
         raise PointsError(
             f"{dataset} has no labeled scans; expected the root of a KITTI object set (training/label_2 below it), of "
             "SemanticKITTI (sequences/*/labels below it), a folder with scans.json (docs/howto/train.md), "

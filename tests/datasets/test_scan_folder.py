@@ -81,6 +81,7 @@ def test_boxes_and_the_labels_of_points_by_them(tmp_path: Path) -> None:
     # The box of the rider alone lies in the cyclist's; a digger is no class of the shipped networks.
     assert frame.labels().tolist() == [1, 3, 0, IGNORE]
     assert frame.labels(("background", "digger", "cyclist")).tolist() == [IGNORE, 2, 0, 1]
+    assert frame.labels(("background", "cyclist", "road")).tolist() == [IGNORE, 1, IGNORE, IGNORE]  # perhaps road
     assert frame.known_at(PLACES).all()
     with pytest.raises(PointsError, match="no labels by points"):
         frame.labels(by="points")
@@ -300,6 +301,9 @@ def test_the_tree_of_semantickitti(tmp_path: Path) -> None:
     assert frame.boxes is None
     with pytest.raises(PointsError, match="no labels by boxes"):
         frame.labels(by="boxes")
+    (tmp_path / "scans.json").write_text(json.dumps({**DESCRIPTION, "files": "semantickitti"}))
+    with pytest.raises(OptionError, match="is of another sensor"):  # the description's, not SemanticKITTI's
+        evaluate([tmp_path], ["pointseg"], mounted=Mounting(2.0, 0.0, 0.0))
 
 
 def test_folders_without_scans_labels_or_description(tmp_path: Path) -> None:
