@@ -151,8 +151,8 @@ FLOORS = {
         release.__init__ release.int8_graph release.models_page release.object_graph release.object_parity
         release.thinned release.triton_model
         release.to_onnx release.triton
-        release.agree release.quantize
-        release.object_int8
+        release.quantize
+        release.agree release.object_int8
         database.__init__ database.files
         database.coco database.folds database.torch
         database.label_page database.scenes

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import onnx
@@ -40,10 +40,10 @@ from edgeperc.types.sensor import SensorProfile
 from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
 from .object_parity import TOP_VIEW, candidate_inputs, objects_of
+from .quantize import few
 from .thinned import profile_of, thinned
 from .to_onnx import write_card
 
-T = TypeVar("T")
 NO_LABELS = KittiLabels((), np.empty((0, 14)))
 
 
@@ -176,17 +176,17 @@ def _measure(
         judge, *of_sets = judges
         if kitti is not None:
             objects = KittiObjects(kitti)
-            for name in _spread(names_of(objects, split), n_scans):
+            for name in few(names_of(objects, split), n_scans):
                 frame = objects.frame(name)
                 truth = judge.kitti(frame if sparse is None else thinned(frame, sparse))
                 yield "real", judge, truth, judge.perceive(truth.points), None
         if semantickitti is not None and judge.from_above is not None:
             roads = SemanticKitti(semantickitti)
-            for name in _spread(roads.names("all"), n_scans):
+            for name in few(roads.names("all"), n_scans):
                 truth = judge.semantickitti(roads.frame(name))
                 yield "road", judge, truth, judge.perceive(truth.points), None
         for folder, judge in zip(labeled, of_sets, strict=True):
-            for name in _spread(names_of(folder, split), n_scans):
+            for name in few(names_of(folder, split), n_scans):
                 yield folder.layout.name, judge, *judge.perceive_frame(folder.frame(name))
 
     records: dict[str, list[Record]] = {}
@@ -221,7 +221,7 @@ def _measure_objects(
     )
     session = next(session for session in perceive.sessions if session.card.view.kind == "objects")
     labels, overlaps, table = [], [], Listed()
-    for name in _spread(names_of(objects, split), n_scans):
+    for name in few(names_of(objects, split), n_scans):
         frame = objects.frame(name)
         truth = FrontTruth(frame.labels or NO_LABELS, frame.calibration, image_size_of(frame.drive))
         boxes = perceive(frame.points).boxes
@@ -241,17 +241,12 @@ def _measure_images(
     perceive = Perceiver([variant.path])
     by = _engine(perceive.sessions[0], precision)
     labels, confusion = [], Confusion(variant.card.classes)
-    for file in _spread(data.files(split), n_images):
+    for file in few(data.files(split), n_images):
         image, truth = data.read(file)
         found = perceive(image=image).require_image()
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)
     return Measured(labels, confusion.mean_iou(), None, by)
-
-
-def _spread(names: Sequence[T], most: int | None) -> Sequence[T]:
-    """At most ``most`` of the names or files, evenly spread."""
-    return names if most is None else names[:: max(1, -(-len(names) // most))]
 
 
 def _ious(block: Mapping[str, Any]) -> list[float]:

@@ -22,12 +22,11 @@ from edgeperc.types.points import Floats32
 from ..data.scans import LabeledScan
 from .int8_graph import sort
 from .object_parity import candidate_inputs, object_figures, objects_of
-from .quantize import Calibration, check_fp32, folded, in_int8, inner_tensors, race, speed_of, write_int8
+from .quantize import Calibration, check_fp32, few, folded, in_int8, inner_tensors, race, speed_of, write_int8
 
 ROUNDED = ("close_point2.weight", "close_point3.weight", "close_point4.weight")
 MOST = 0.99995  # quantile of a tensor's values that the largest 8-bit number stands for
 N_VALUES = 20_000  # of each tensor and batch
-BATCH = 64
 
 
 def quantize_objects(
@@ -72,11 +71,11 @@ def quantize_objects(
 
 
 def candidate_batches(card: ModelCard, scans: Sequence[NDArray[Any] | LabeledScan]) -> Iterator[Floats32]:
-    """Inputs of the clusters of scans, (n, points, channels), at most `BATCH` of each."""
+    """Inputs of the clusters of scans, (n, points, channels), a `few` of each."""
     for scan in scans:
         features, _, _ = candidate_inputs(card, scan.points if isinstance(scan, LabeledScan) else scan)
         if len(features):
-            yield features[:: max(1, len(features) // BATCH)][:BATCH]
+            yield features[few(range(len(features)))]
 
 
 def rounded(

@@ -150,14 +150,14 @@ def calibration_scans(
         frames[name] = number
     if kitti is not None:
         objects = KittiObjects(kitti)
-        for frame in map(objects.frame, _few(objects.names("train", grades="AB"))):
+        for frame in map(objects.frame, few(objects.names("train", grades="AB"))):
             scans.append(frame.points)
             frames[frame.name] = scan_hash(frame.points)
     for folder in sets:
         check_trains(folder, "train")
         of_set, _, own = read_scan_set(folder, "train")
-        scans += _few(of_set)
-        frames |= dict(_few([*own.items()]))
+        scans += few(of_set)
+        frames |= dict(few([*own.items()]))
     scans += [simulated_scan(FIRST_SEED + k).points for k in range(n_simulated)]
     if not scans:
         asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
@@ -176,15 +176,16 @@ def _scans_in(folder: Path) -> list[Path]:
     return files
 
 
-def _few(each: Sequence[T], most: int = 64) -> Sequence[T]:
-    """At most so many, evenly spread."""
-    return each[:: max(1, len(each) // most)][:most]
+def few(each: Sequence[T], most: int | None = 64) -> Sequence[T]:
+    """At most so many, evenly spread; None: all."""
+    n = len(each) if most is None else min(most, len(each))
+    return [each[k * len(each) // n] for k in range(n)]
 
 
 def calibration_images(camvid: Path) -> Calibration:
     """64 training images of CamVid, evenly spread."""
     data = LabeledImages(camvid)
-    images = {file.stem: data.read(file)[0] for file in _few(data.files("train"))}
+    images = {file.stem: data.read(file)[0] for file in few(data.files("train"))}
     return Calibration([*images.values()], {name: image_hash(image) for name, image in images.items()})
 
 
@@ -241,7 +242,7 @@ class Calibrated:
     ) -> Calibrated:
         """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
         model, images = folded(path), [image[None] for image, _ in views(card, scans)]
-        probes = _few(images, N_PROBES)
+        probes = few(images, N_PROBES)
         outputs = _outputs(model, card, probes)
         names = [name for node in model.graph.node for name in node.output if name]
         if strength:

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -338,6 +339,15 @@ def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarr
     found, frames = calibration_scans([training, nowhere.parent])
     assert [len(points) for points in found] == [len(scans[0])] * 2
     assert sets_of(frames) == {"KITTI", "scans to calibrate on"}
+
+
+def test_images_to_calibrate_on_are_spread_over_the_whole_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [Path(f"{k}.png") for k in range(100)]
+    images = SimpleNamespace(files=lambda split: files, read=lambda file: (np.array([int(file.stem)]), None))
+    monkeypatch.setattr(module, "LabeledImages", lambda root: images)
+    found = np.concatenate(module.calibration_images(Path("camvid")).scans)
+    assert len(found) == 64
+    assert (found[0], found[32], found[63]) == (0, 50, 98)  # the last third was left out
 
 
 def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> None:
