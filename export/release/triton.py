@@ -13,9 +13,8 @@ from pathlib import Path
 from edgeperc.errors import ModelError
 from edgeperc.system.atomic import write_atomic
 from edgeperc.types.card import ModelCard
-from edgeperc.types.detector import PillarGeometry
 from edgeperc.types.sensor import get_sensor
-from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, model_path
 
 from . import triton_model
@@ -29,14 +28,15 @@ def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, senso
     """
     name = get_sensor(sensor).name
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]
-    taken = {PIPELINE}
+    taken, views = {PIPELINE}, {"range_image", "top_view", "objects"}
     for card, path in files:
-        if card.name.lower() in taken or isinstance(card.view, CameraGeometry | PillarGeometry):
+        if card.name.lower() in taken or card.view.kind not in views:
             raise ModelError(
-                f"{path}: {card.name} is of a camera or of pillars, or there are two; expected networks of range "
-                "images, top views and objects"
+                f"{path}: {card.name} is of a camera or of pillars, or another one has its name or view; expected at "
+                "most one network of range images, one of top views and one of objects"
             )
         taken.add(card.name.lower())  # one folder, where upper and lower case are the same
+        views.remove(card.view.kind)
     version = out / PIPELINE / "1"
     version.mkdir(parents=True, exist_ok=True)
     for old in version.glob("*.onnx"):

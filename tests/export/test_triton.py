@@ -158,8 +158,9 @@ def test_what_is_written(repository: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="two"):
-        write_repository(tmp_path, ["pointseg", "pointseg:int8"])
+    for other in ("pointseg:int8", "sceneseg"):
+        with pytest.raises(ModelError, match="another one has its name or view"):
+            write_repository(tmp_path, ["pointseg", other])
     with pytest.raises(SensorError):
         write_repository(tmp_path, sensor="nothing")
     assert not [*tmp_path.iterdir()]
