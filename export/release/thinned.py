@@ -3,7 +3,7 @@
 Run as ``python -m edgeperc_export.release.thinned KITTI [--sensors vlp-16] [--models pointseg:int8 pointseg]``. Of the
 HDL-64E's beams, those nearest to the sensor's remain, with its columns; its range, noise and remission stay, and none
 looks up by more than 2 degrees. Prints a table of Markdown: of the network alone, and of the whole answer, with
-its boxes. ``--drives 0001`` takes drives of successive scans instead, each alone and with the points of the last
+its boxes. ``--drives 0001`` takes the labeled scans of drives instead, each alone and with the points of the last
 ``--sweeps`` scans (`edgeperc.Sweeps`), at the poses that KISS-ICP finds in the thinned scans (extra ``slam``).
 """
 
@@ -65,7 +65,7 @@ def row_of_drive(kitti: KittiObjects, drive: str, sensor: str, n: int) -> str:
     profile = get_sensor(sensor) if sensor == DEFAULT_SENSOR else profile_of(sensor)
     perceive, tracker, counts = Perceiver(sensor=profile, on_mismatch="ignore"), Tracker(), Listed()
     sweeps, odometry = (Sweeps(n), Odometry()) if n > 1 else (None, None)
-    for k, name in enumerate(name for name, of in kitti.drives.items() if of.endswith(drive)):
+    for k, name in enumerate(name for name in kitti.grades if kitti.drives[name].endswith(drive)):
         frame, stamp_s, pose, earlier = kitti.frame(name), 0.1 * k, None, None
         points = frame.points if sensor == DEFAULT_SENSOR else thinned(frame, profile).points
         if odometry is not None and sweeps is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from edgeperc_export.data.beams import drawn_sensor, taken_by
 from edgeperc_export.data.scan_sets import seen_by_network
 from edgeperc_export.data.scans import LabeledScan
 from edgeperc_export.recipe import Recipe
+from edgeperc_export.release.thinned import main
 from edgeperc_export.training.samples import Samples
 
 SEED = 1_500_000_001
@@ -139,3 +141,13 @@ def test_the_recipe_says_how_often(tmp_path_factory: pytest.TempPathFactory, sca
         empty.append(float(np.mean(labels == IGNORE)))
     np.testing.assert_array_equal(samples.batch(0)[1], labels)
     assert empty[0] < empty[1] < empty[2]
+
+
+def test_a_drive_is_judged_by_its_last_scans(kitti_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("kiss_icp", reason="the extra slam is not installed")
+    main([str(kitti_root), "--sensors", "vlp-16", "--drives", "0048", "--sweeps", "1", "3"])
+    *_, alone, three = capsys.readouterr().out.splitlines()
+    assert alone.startswith("| 0048 | vlp-16 | 1 | ")
+    assert three.startswith("| 0048 | vlp-16 | 3 | ")
+    assert all(0.0 <= float(value) <= 100.0 or value == "nan" for value in three.split(" | ")[3].split(" / "))
+    assert three.split(" | ")[3] != alone.split(" | ")[3]
