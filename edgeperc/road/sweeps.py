@@ -57,7 +57,7 @@ class Sweeps:
 
     Call `earlier` with each scan before it is perceived, and `add` after it was tracked::
 
-        perceive, tracker, sweeps = Perceiver(sensor="vlp-16"), Tracker(), Sweeps(5)
+        perceive, tracker, sweeps = Perceiver(sensor="vlp-16"), Tracker(), Sweeps()
         for stamp_s, points, pose in drive:
             earlier = sweeps.earlier(points, stamp_s, pose)
             perception = perceive(points, stamp_s, earlier=earlier)
@@ -75,7 +75,7 @@ class Sweeps:
         ``n`` is not a whole number from 2 to 20.
     """
 
-    def __init__(self, n: int = 5) -> None:
+    def __init__(self, n: int = 10) -> None:
         self._sweeps = deque[_Sweep](maxlen=OPTIONS.whole("n", n, 2, MAX_SWEEPS) - 1)
         self._gap_rad, self._eye, self._frame = LEAST_GAP_RAD, np.zeros(2), OF_MODELS
         nothing = read_only(np.empty((0, 4), np.float32))
