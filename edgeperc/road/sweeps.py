@@ -39,6 +39,10 @@ BEYOND_M, LEAST_GAP_RAD = 0.6, math.radians(0.4)
 GROUND_STEP = 6  # one point in so many is looked at for the ground
 # Ground that counts: so near, and so near to that of the newest scan; at least so many points.
 GROUND_REACH_M, GROUND_OFF_M, LEAST_GROUND = 30.0, 0.7, 50
+# Largest share of the heights that may remain. With the poses of KISS-ICP in two drives of KITTI, ground 15 to 25 m away
+# and 0.9 s ago is off by 0.117 and 0.041 m (median) on a VLP-16, 0.029 and 0.016 so; by 0.011 and 0.009 m on a Mid-360,
+# 0.014 and 0.009 so, and 0.029 and 0.020 if all of it were taken off.
+GAIN = 0.8
 
 
 class _Sweep(NamedTuple):
@@ -189,7 +193,8 @@ def _moved(points: Points, T: Floats) -> Floats32:
 
 def _leveling(ground: Points, height_m: Floats32) -> Floats:
     """The small rotation about x and y and the shift along z (4, 4) that take heights off points of the ground: a plane
-    is fitted to them, three times, the last two without what is far from it.
+    is fitted to them, three times, the last two without what is far from it. None where that gains little: the pose is
+    then better than what little ground there is.
     """
     near = np.hypot(ground[:, 0], ground[:, 1]) < GROUND_REACH_M
     near &= np.abs(height_m) < GROUND_OFF_M  # False for NaN
@@ -202,6 +207,8 @@ def _leveling(ground: Points, height_m: Floats32) -> Floats:
         a, b, c = np.linalg.lstsq(places[kept], heights[kept], rcond=None)[0].tolist()
         off_m = np.abs(heights - places @ (a, b, c))
         kept = off_m < max(3.7 * float(np.median(off_m[kept])), 0.03)  # 2.5 standard deviations
+    if np.median(off_m) > GAIN * np.median(np.abs(heights)):
+        return leveling
     leveling[:3, :3] = [[1.0, 0.0, a], [0.0, 1.0, b], [-a, -b, 1.0]]
     leveling[:3, :3] /= np.linalg.norm(leveling[:3, :3], axis=0)
     leveling[2, 3] = -c
