@@ -39,9 +39,9 @@ BEYOND_M, LEAST_GAP_RAD = 0.6, math.radians(0.4)
 GROUND_STEP = 6  # one point in so many is looked at for the ground
 # Ground that counts: so near, and so near to that of the newest scan; at least so many points.
 GROUND_REACH_M, GROUND_OFF_M, LEAST_GROUND = 30.0, 0.7, 50
-# Largest share of the heights that may remain. With the poses of KISS-ICP in two drives of KITTI, ground 15 to 25 m away
-# and 0.9 s ago is off by 0.117 and 0.041 m (median) on a VLP-16, 0.029 and 0.016 so; by 0.011 and 0.009 m on a Mid-360,
-# 0.014 and 0.009 so, and 0.029 and 0.020 if all of it were taken off.
+# Largest share of the heights that may remain. With KISS-ICP's poses in two drives of KITTI, ground 15 to 25 m away and
+# 0.9 s ago is off by 0.117 and 0.041 m (median) on a VLP-16, 0.029 and 0.016 so; on a Mid-360 by 0.011 and 0.009 m, so
+# 0.014 and 0.009, and 0.029 and 0.020 if all of it were taken off.
 GAIN = 0.8
 
 
