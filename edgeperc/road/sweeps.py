@@ -44,6 +44,8 @@ GROUND_REACH_M, GROUND_OFF_M, LEAST_GROUND = 30.0, 0.7, 50
 # 0.014 and 0.009, and 0.029 and 0.020 if all of it were taken off.
 GAIN = 0.8
 
+NOTHING = read_only(np.empty((0, 4), np.float32))
+
 
 class _Sweep(NamedTuple):
     """A scan without people in the frame of the sensor at that time, some points of its ground, its tracks, and what
@@ -82,8 +84,7 @@ class Sweeps:
     def __init__(self, n: int = 10) -> None:
         self._sweeps = deque[_Sweep](maxlen=OPTIONS.whole("n", n, 2, MAX_SWEEPS) - 1)
         self._gap_rad, self._eye, self._frame = LEAST_GAP_RAD, np.zeros(2), OF_MODELS
-        nothing = read_only(np.empty((0, 4), np.float32))
-        self._still_there(nothing, nothing)  # compile here, not in the first call
+        self._still_there(NOTHING, NOTHING)  # compile here, not in the first call
 
     def reset(self) -> None:
         """Forget all scans, for another drive."""
@@ -118,7 +119,7 @@ class Sweeps:
         T_sensor_world = np.linalg.inv(rigid("T_world_sensor", T_world_sensor, TrackingError))
         sweeps = [sweep for sweep in self._sweeps if 0.0 < stamp_s - sweep.tracks.stamp_s <= MAX_AGE_S]
         if not sweeps:
-            return read_only(np.empty((0, 4), np.float32))
+            return NOTHING
         standing = {track.id for track in self._sweeps[-1].tracks if _stands(track)}
         found = []
         motions = [T_sensor_world @ sweep.tracks.T_world_sensor for sweep in sweeps]
@@ -162,7 +163,7 @@ class Sweeps:
             self._gap_rad = max(LEAST_GAP_RAD, math.radians(perception.sensor.median_gap_deg))
         seen, some = scan[~left_out & np.isfinite(scan[:, 0])], scan[::GROUND_STEP]
         ground = some[heights_above(perception.ground, self._frame.move(some)).mask]
-        self._sweeps.append(_Sweep(read_only(seen), ground, tracks, found))
+        self._sweeps.append(_Sweep(seen, ground, tracks, found))
 
     def _on_its_ground(self, scan: Points, sweeps: Sequence[_Sweep], motions: Sequence[Floats]) -> list[Floats]:
         """The motions (4, 4) of earlier scans, each turned and raised so that their ground lies on that of a scan."""
@@ -170,7 +171,7 @@ class Sweeps:
         to_model[:3, :3], to_model[:3, 3] = self._frame.R, self._frame.t
         moved = [_moved(sweep.ground, to_model @ T) for sweep, T in zip(sweeps, motions, strict=True)]
         surface = fit_ground(self._frame.move(scan)).surface()
-        heights = heights_above(surface, read_only(np.concatenate(moved))).height_m
+        heights = heights_above(surface, np.concatenate(moved)).height_m
         ends = np.cumsum([len(points) for points in moved])[:-1]
         return [
             np.linalg.inv(to_model) @ _leveling(points, height) @ to_model @ T
@@ -181,14 +182,14 @@ class Sweeps:
         """Which earlier points (n, 4) no beam of a scan contradicts, (n,)."""
         is_there = np.empty(len(earlier), np.bool_)
         step = np.array([COLUMN_RAD, 0.5 * self._gap_rad])
-        mark_still_there(read_only(scan), read_only(earlier), self._eye, step, BEYOND_M, is_there)
+        mark_still_there(read_only(scan), earlier, self._eye, step, BEYOND_M, is_there)
         return is_there
 
 
 def _moved(points: Points, T: Floats) -> Floats32:
     moved = np.empty(points.shape, np.float32)
     fill_moved(read_only(points), T[:3, :3].copy(), T[:3, 3].copy(), moved)
-    return moved
+    return read_only(moved)
 
 
 def _leveling(ground: Points, height_m: Floats32) -> Floats:
