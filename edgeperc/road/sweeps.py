@@ -17,16 +17,16 @@ from numpy.typing import ArrayLike
 
 from ..errors import OptionError, StampError, TrackingError
 from ..ground.planes import fit_ground, heights_above
+from ..preprocess.returns import returns
 from ..system.clock import as_seconds
 from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..tracking import Track, Tracks
 from ..tracking.moving import PEOPLE, inside_boxes, movable_points
-from ..types.frame import OF_MODELS, ModelFrame, fill_moved
+from ..types.frame import OF_MODELS, ModelFrame, moved_points
 from ..types.perception import Box, Perception, scan_of
 from ..types.points import Floats, Floats32, Mask, Points, as_points, read_only
 from ..types.rigid import rigid
-from ..types.sensor import SensorProfile
 
 MAX_SWEEPS = 20
 MAX_AGE_S = 3.0  # older scans are left out, as those before a pause or of another drive
@@ -121,13 +121,13 @@ class Sweeps:
         if not sweeps:
             return NOTHING
         standing = {track.id for track in self._sweeps[-1].tracks if _stands(track)}
-        found = []
+        moved = []
         motions = [T_sensor_world @ sweep.tracks.T_world_sensor for sweep in sweeps]
         for sweep, T in zip(sweeps, self._on_its_ground(scan, sweeps, motions), strict=True):
             boxes = [box for box, track in sweep.boxes if track not in standing]
-            seen = _moved(sweep.points[~inside_boxes(boxes, sweep.points, MARGIN_M)], T)
-            found.append(seen[self._still_there(scan, seen)])
-        return read_only(np.concatenate(found))
+            moved.append(_moved(sweep.points[~inside_boxes(boxes, sweep.points, MARGIN_M)], T))
+        seen = np.concatenate(moved)
+        return read_only(seen[self._still_there(scan, seen)])
 
     def add(self, points: ArrayLike, perception: Perception, tracks: Tracks) -> None:
         """Remember a scan that was perceived and tracked.
@@ -158,12 +158,12 @@ class Sweeps:
         found = [(track.box, track.id) for track in tracks]
         found += [(box, NO_TRACK) for k, box in enumerate(perception.boxes) if k not in tracks.sources]
         self._frame, self._eye = ModelFrame(perception.mounting), np.array(perception.mounting.origin_m)
-        if perception.sensor is not None:
-            left_out |= _not_of_the_world(scan, perception.sensor, self._eye)
-            self._gap_rad = max(LEAST_GAP_RAD, math.radians(perception.sensor.median_gap_deg))
-        seen, some = scan[~left_out & np.isfinite(scan[:, 0])], scan[::GROUND_STEP]
+        some = scan[::GROUND_STEP]
         ground = some[heights_above(perception.ground, self._frame.move(some)).mask]
-        self._sweeps.append(_Sweep(seen, ground, tracks, found))
+        if perception.sensor is not None:
+            scan = returns(scan, perception.sensor, perception.mounting.origin_m)[0]  # without the own vehicle
+            self._gap_rad = max(LEAST_GAP_RAD, math.radians(perception.sensor.median_gap_deg))
+        self._sweeps.append(_Sweep(scan[~left_out & np.isfinite(scan[:, 0])], ground, tracks, found))
 
     def _on_its_ground(self, scan: Points, sweeps: Sequence[_Sweep], motions: Sequence[Floats]) -> list[Floats]:
         """The motions (4, 4) of earlier scans, each turned and raised so that their ground lies on that of a scan."""
@@ -182,14 +182,12 @@ class Sweeps:
         """Which earlier points (n, 4) no beam of a scan contradicts, (n,)."""
         is_there = np.empty(len(earlier), np.bool_)
         step = np.array([COLUMN_RAD, 0.5 * self._gap_rad])
-        mark_still_there(read_only(scan), earlier, self._eye, step, BEYOND_M, is_there)
+        mark_still_there(read_only(scan), read_only(earlier), self._eye, step, BEYOND_M, is_there)
         return is_there
 
 
 def _moved(points: Points, T: Floats) -> Floats32:
-    moved = np.empty(points.shape, np.float32)
-    fill_moved(read_only(points), T[:3, :3].copy(), T[:3, 3].copy(), moved)
-    return read_only(moved)
+    return moved_points(points, (T[:3, :3].copy(), T[:3, 3].copy()))
 
 
 def _leveling(ground: Points, height_m: Floats32) -> Floats:
@@ -214,16 +212,6 @@ def _leveling(ground: Points, height_m: Floats32) -> Floats:
     leveling[:3, :3] /= np.linalg.norm(leveling[:3, :3], axis=0)
     leveling[2, 3] = -c
     return leveling
-
-
-def _not_of_the_world(scan: Points, sensor: SensorProfile, eye: Floats) -> Mask:
-    """Mark what is too near to a sensor, or of the vehicle that carries it: it goes along."""
-    about = scan[:, :3].astype(np.float64) - [*eye, 0.0]
-    found = np.linalg.norm(about, axis=1) <= sensor.min_range_m
-    if sensor.ego_box is not None:
-        lows, highs = np.array(sensor.ego_box).T
-        found |= ((lows <= about) & (about <= highs)).all(axis=1)
-    return np.asarray(found)
 
 
 def _stands(track: Track) -> bool:

@@ -63,11 +63,11 @@ class ModelFrame:
         """A scan, as a `Perceiver` takes it, (n, 4) float32 in the models' frame, read-only; the same array if nothing
         moves.
         """
-        return _moved_points(points, None if self.is_identity else (self.R, self.t))
+        return moved_points(points, None if self.is_identity else (self.R, self.t))
 
     def move_back(self, points: ArrayLike) -> Floats32:
         """Points of the models' frame as a sensor of this mounting sees them; as `move`."""
-        return _moved_points(points, None if self.is_identity else (self.R.T.copy(), -self.R.T @ self.t))
+        return moved_points(points, None if self.is_identity else (self.R.T.copy(), -self.R.T @ self.t))
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
         """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
@@ -125,7 +125,8 @@ def pose_between(first: tuple[Floats, Floats], second: tuple[Floats, Floats], sh
     return np.asarray(pose, np.float64)
 
 
-def _moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Floats32:
+def moved_points(points: ArrayLike, motion: tuple[Floats, Floats] | None) -> Floats32:
+    """A scan whose points p lie at ``R p + t`` [m], (n, 4) float32, read-only; the same array if nothing moves."""
     scan = as_points(points)
     if motion is None:
         return scan
