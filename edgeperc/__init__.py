@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .road.grid import OccupancyGrid, occupancy_grid
     from .road.rolling import RollingGrid
-    from .road.sweeps import Sweeps
+    from .road.sweeps import SweepPerceiver, Sweeps
     from .tracking import Track, Tracker, Tracks, smooth_tracks
     from .tracking.moving import movable_points, moving_points
     from .tracking.zones import Crossing, Line, Zone
@@ -126,6 +126,7 @@ __all__ = [
     "SplitError",
     "StampError",
     "Stream",
+    "SweepPerceiver",
     "Sweeps",
     "TimedScan",
     "TopView",
@@ -177,7 +178,7 @@ _NAMES = {
     "road.ahead": ("FreeAhead", "RoadAhead", "free_ahead", "road_ahead"),
     "road.grid": ("OccupancyGrid", "occupancy_grid"),
     "road.rolling": ("RollingGrid",),
-    "road.sweeps": ("Sweeps",),
+    "road.sweeps": ("SweepPerceiver", "Sweeps"),
     "tracking": ("Track", "Tracker", "Tracks", "smooth_tracks"),
     "tracking.moving": ("movable_points", "moving_points"),
     "tracking.zones": ("Crossing", "Line", "Zone"),

@@ -6,6 +6,7 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -97,9 +98,11 @@ class Perceive:
 
     def __init__(self) -> None:
         self.stamps: list[float] = []
+        self.earlier: list[np.ndarray] = []
 
-    def __call__(self, points: np.ndarray, *, stamp_s: float) -> Perception:
+    def __call__(self, points: np.ndarray, *, stamp_s: float, earlier: Sequence[Any] = ()) -> Perception:
         self.stamps.append(stamp_s)
+        self.earlier.append(np.asarray(earlier))
         labels = PointLabels(np.ones(len(points), np.uint8), np.ones(len(points), np.bool_), ("background", "car"))
         return Perception(len(points), 0, labels, None, (), {"infer": 1.0}, {"m": "cpu"}, (), stamp_s)
 

@@ -179,8 +179,11 @@ def ghost_share(scans: Sequence[Points], kept: Sequence[Mask], moving: Sequence[
 
 def kiss_icp(scans: Sequence[Points]) -> Poses:
     """Poses (k, 4, 4) of KISS-ICP, the first one at the origin."""
-    odometry = Odometry()
-    return np.array([odometry(points) for points in scans])
+    odometry, poses = Odometry(), []
+    for k, points in enumerate(scans):
+        odometry(points, k / RATE_HZ)
+        poses.append(odometry.T_world_sensor)
+    return np.array(poses)
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,13 @@ def add_parser(commands: Commands) -> None:
         "(default: the first seven, and rolling with --odometry)",
     )
     output("--no-track", "do not track the boxes from scan to scan")
+    output(
+        "--sweeps N",
+        "find objects and the ground with the points of the last N clouds, 2 to 20, on what stands still: for sensors "
+        "of few beams. The sensor moves as --odometry says, else as KISS-ICP finds (extra 'slam') (default: each cloud "
+        "alone)",
+        type=positive,
+    )
     output("--frame NAME", "frame of the answers (default: that of the clouds)")
     output(
         "--grid-frame NAME",
@@ -121,7 +128,7 @@ def add_parser(commands: Commands) -> None:
     graph(
         "--ros-args ARGUMENT",
         "with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
-        "frame, grid_frame, prefix, rate, publish, odometry, sensor_pose, remember, grid_size; such as "
+        "frame, grid_frame, prefix, rate, publish, sweeps, odometry, sensor_pose, remember, grid_size; such as "
         "-p sensor:=os1-64 (default: none)",
         nargs=argparse.REMAINDER,
         default=[],
@@ -139,6 +146,8 @@ def ros2_command(arguments: argparse.Namespace) -> int:
     try:
         _take_parameters(graph, arguments)
         check_sensor(arguments)
+        if arguments.sweeps is not None and arguments.no_track:
+            raise OptionError("--sweeps needs tracks, to tell what stands; leave out --no-track")
         for model in chosen_models(arguments):  # no cloud heals a wrong name, and the first may come late
             resolve(model)
         made = [] if arguments.sensor is None else [_perceiver(arguments, arguments.sensor)]
@@ -168,6 +177,7 @@ def ros2_command(arguments: argparse.Namespace) -> int:
             prefix=arguments.prefix or "",
             outputs=arguments.publish or USUAL_OUTPUTS,
             rolling=_rolling(arguments),
+            n_sweeps=arguments.sweeps,
             **keywords(arguments, "lifecycle", frame_id="frame", grid_frame_id="grid_frame", rate_hz="rate"),
         )
     except BaseException:
@@ -225,6 +235,7 @@ def _take_parameters(graph: Graph, arguments: argparse.Namespace) -> None:
     arguments.sensor_pose = None if pose == [0.0] else pose
     for name in ("rate", "remember", "grid_size"):
         setattr(arguments, name, graph.parameter(name, getattr(arguments, name)))
+    arguments.sweeps = graph.parameter("sweeps", arguments.sweeps or 0) or None
 
 
 def _rolling(arguments: argparse.Namespace) -> Rolling | None:

@@ -328,8 +328,8 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     if arguments.consistency is not None and (arguments.live or not arguments.track):
         arguments.usage_error("--consistency needs --track, and no --live: it is of a whole drive")
     if arguments.sweeps is not None:
-        if arguments.live or arguments.scan or not arguments.track:
-            arguments.usage_error("--sweeps needs --track, and no --live or --scan")
+        if arguments.scan or not arguments.track:
+            arguments.usage_error("--sweeps needs --track, and no --scan")
         if not 2 <= arguments.sweeps <= 20:
             arguments.usage_error(f"--sweeps is {arguments.sweeps}; expected 2 to 20 scans")
         if _needs_odometry(arguments):
@@ -516,8 +516,8 @@ class _Run:
                 try:
                     if self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    pose, earlier = self._pose(points, how["origin_m"]), None
-                    if self._sweeps is not None and pose is not None:
+                    pose, earlier = self._pose(points, at_s, how["origin_m"]), None
+                    if self._sweeps is not None:
                         earlier = self._sweeps.earlier(points, at_s, pose)
                     perception = perceive(points, stamp_s, origin_m=how["origin_m"], earlier=earlier)
                     if self._kinds and numbered:
@@ -583,7 +583,7 @@ class _Run:
                 calib = calibration_of(arguments.calib, str(scan))
                 calibration = Calibration.from_kitti(calib, image.shape[1], image.shape[0])
                 view.draw_painted(perception, image, points, calibration, wanted.pop("both"), title=path.name)
-            pose = self._pose(points, origin)
+            pose = self._pose(points, at_s, origin)
             yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, pose, scan)
         except (EdgepercError, OSError) as exc:
             yield path, exc, None, None
@@ -597,10 +597,16 @@ class _Run:
         name_of = scan_namer(path)
         sensor = self._perceivers.sensor_of(path)
         perceiver = self._perceivers.of(sensor)
-        perceive = perceiver.__call__  # without a sensor, of which `stream` would warn again
+        perceive: Callable[..., Perception] = perceiver.__call__  # without a sensor, of which `stream` would warn again
+        track: Callable[..., Tracks | None] | None = self._tracker
+        if self._tracker is not None and self._odometry is not None:
+            from ..road.sweeps import SweepPerceiver
+
+            swept = SweepPerceiver(perceive, self._tracker, self._odometry, self._arguments.sweeps)
+            perceive, track = swept, swept.track
         rate_hz, topic = self._arguments.rate, self._arguments.topic
         gathered_s = _gathered_s(path, sensor)
-        with stream(path, perceive, self._tracker, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
+        with stream(path, perceive, track, rate_hz=rate_hz, topic=topic, accumulate_s=gathered_s) as answers:
             while True:
                 try:
                     answer = answers.take()
@@ -634,11 +640,11 @@ class _Run:
 
         source = str(scan or name)
         tracks = None
-        if self._tracker is not None:
+        if self._tracker is not None and not (self._odometry is not None and pose is None):
             tracks = self._tracker.update(perception.boxes, stamp_s, pose, mounting=perception.mounting)
         if self._straightener is not None and tracks is not None:
             self._straightener.follow(tracks)
-        if self._sweeps is not None and tracks is not None and (self._odometry is None or self._odometry.is_settled):
+        if self._sweeps is not None and tracks is not None:
             self._sweeps.add(points, perception, tracks)
         try:
             if "png" in wanted:
@@ -654,14 +660,14 @@ class _Run:
         under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
         return name, perception, tracks, under
 
-    def _pose(self, points: Points, origin_m: Sequence[float] | None) -> ArrayLike | None:
+    def _pose(self, points: Points, stamp_s: float, origin_m: Sequence[float] | None) -> ArrayLike | None:
         """Pose of the sensor, seen from that of the first scan: by ``--poses``, where its place in a map is known,
         whose axes are then its own, or for ``--sweeps`` by an odometry.
         """
         if self._straightener is not None and self._straightener.pose is not None:
             return self._straightener.pose
         if origin_m is None:
-            return None if self._odometry is None else self._odometry(points)
+            return None if self._odometry is None else self._odometry(points, stamp_s)
         self._first_place = self._first_place or (origin_m[0], origin_m[1], origin_m[2])
         x, y, z = (a - b for a, b in zip(origin_m, self._first_place, strict=True))
         return [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]]

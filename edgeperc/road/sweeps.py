@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,7 +90,7 @@ class Sweeps:
         """Forget all scans, for another drive."""
         self._sweeps.clear()
 
-    def earlier(self, points: ArrayLike, stamp_s: float, T_world_sensor: ArrayLike) -> Floats32:
+    def earlier(self, points: ArrayLike, stamp_s: float, T_world_sensor: ArrayLike | None) -> Floats32:
         """The points of earlier scans where the newest scan would have them, for ``Perceiver(..., earlier=...)``.
 
         Parameters
@@ -99,9 +99,9 @@ class Sweeps:
             The newest scan: x, y, z [m] in the frame of the sensor.
         stamp_s : float
             Its time [s], on the clock of the tracked scans.
-        T_world_sensor : (4, 4) array_like
+        T_world_sensor : (4, 4) array_like or None
             Its rigid pose, in the world of the poses with which the earlier scans were tracked, as an odometry finds it
-            (`Odometry`). A tracker's own estimate is not exact enough.
+            (`Odometry`). A tracker's own estimate is not exact enough. Without a pose, all earlier scans are forgotten.
 
         Returns
         -------
@@ -113,6 +113,9 @@ class Sweeps:
         PointsError, StampError, TrackingError
             The scan, its time or its pose is malformed.
         """
+        if T_world_sensor is None:
+            self.reset()
+            return NOTHING
         scan, stamp_s = as_points(points), as_seconds(stamp_s)
         if not math.isfinite(stamp_s):
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds")
@@ -184,6 +187,74 @@ class Sweeps:
         step = np.array([COLUMN_RAD, 0.5 * self._gap_rad])
         mark_still_there(read_only(scan), read_only(earlier), self._eye, step, BEYOND_M, is_there)
         return is_there
+
+
+class SweepPerceiver:
+    """Perceives each scan with those before it, and tracks its boxes; for `edgeperc.stream`::
+
+        perceive = SweepPerceiver(Perceiver(sensor="vlp-16"), Tracker(), Odometry())
+        with stream("udp:2368", perceive, perceive.track) as live:
+            ...
+
+    Parameters
+    ----------
+    perceiver : Perceiver
+    tracker : Tracker
+        Its poses are those of the odometry.
+    odometry : callable
+        ``odometry(points, stamp_s) -> pose``, (4, 4), of the sensor in a fixed world, or None where it is not known,
+        such as an `Odometry`. A scan without a pose is perceived alone, and has no tracks.
+    n : int
+        As in `Sweeps`.
+
+    Raises
+    ------
+    OptionError
+        ``n`` is not a whole number from 2 to 20.
+    """
+
+    def __init__(
+        self,
+        perceiver: Callable[..., Perception],
+        tracker: Callable[..., Tracks],
+        odometry: Callable[[ArrayLike, float], ArrayLike | None],
+        n: int = 10,
+    ) -> None:
+        self._perceiver, self._tracker, self._odometry = perceiver, tracker, odometry
+        self._sweeps = Sweeps(n)
+        self._points: ArrayLike = NOTHING
+        self._pose: ArrayLike | None = None
+        self._untimed: StampError | None = None
+
+    @property
+    def sensor(self) -> Any:
+        """That of the perceiver."""
+        return getattr(self._perceiver, "sensor", None)
+
+    def __call__(self, points: ArrayLike, stamp_s: float) -> Perception:
+        """Perceive the next scan; arguments and errors are those of the `Perceiver`."""
+        self._points, self._pose, self._untimed = points, None, None
+        try:
+            self._pose = self._odometry(points, stamp_s)
+        except StampError as exc:
+            self._untimed = exc
+        return self._perceiver(points, stamp_s=stamp_s, earlier=self._sweeps.earlier(points, stamp_s, self._pose))
+
+    def track(self, perception: Perception) -> Tracks | None:
+        """Track the boxes of the scan that was perceived last; None if its pose is not known.
+
+        Raises
+        ------
+        StampError
+            The scan has no usable time.
+        """
+        if self._untimed is not None:
+            raise self._untimed
+        if self._pose is None:
+            return None
+        tracks = self._tracker(perception, self._pose)
+        self._sweeps.add(self._points, perception, tracks)
+        return tracks
 
 
 def _moved(points: Points, T: Floats) -> Floats32:

@@ -16,16 +16,21 @@ import numpy as np
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError, TrackingError
 from ..live import check_rate, stream
 from ..readers.clouds import cloud_points, describe_cloud
+from ..readers.scan_odometry import Odometry
 from ..readers.tables import MAX_SCAN_BYTES
 from ..records import PerceivedScan
 from ..road.grid import Split, split_points
+from ..road.sweeps import MAX_SWEEPS, SweepPerceiver
 from ..system.clock import Stamp
+from ..system.fields import OPTIONS
 from ..system.names import check_text
 from . import messages
 from .graph import TRANSITIONS, Graph, Output, State, full_name
 from .odometry import ODOMETRY, Poses, Rolling
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..tracking.tracker import Tracker
@@ -70,7 +75,8 @@ class PerceptionNode:
     topic : str
         Of sensor_msgs/PointCloud2.
     tracker : Tracker, optional
-        With ``rolling``, it takes the poses of the odometry, and a cloud without one is answered without tracks.
+        With ``rolling`` or ``n_sweeps``, it takes the poses of the odometry, and a cloud without one is answered
+        without tracks.
     frame_id : str, optional
         Frame of the answers, by default that of each cloud.
     grid_frame_id : str, optional
@@ -84,6 +90,9 @@ class PerceptionNode:
         published because vision_msgs is not installed, a warning says so.
     rolling : Rolling, optional
         Odometry and grid of the output ``rolling``; without it, there is none.
+    n_sweeps : int, optional
+        Clouds in which objects and ground are found together, with the newest one (`edgeperc.Sweeps`); needs a tracker.
+        The poses are those of the odometry's topic of ``rolling``, or else an `edgeperc.Odometry` finds them.
     lifecycle : bool
         Begin unconfigured, and wait for `change_state` or, where the graph can, for a lifecycle manager. By default the
         node is active at once.
@@ -91,9 +100,9 @@ class PerceptionNode:
     Raises
     ------
     MissingExtraError
-        rosbags is not installed.
+        rosbags, or what finds the poses for ``n_sweeps``, is not installed.
     OptionError
-        A name is not valid, or two topics are one.
+        A name is not valid, two topics are one, or ``n_sweeps`` is not 2 to 20 or has no tracker.
 
     Examples
     --------
@@ -116,6 +125,7 @@ class PerceptionNode:
         rate_hz: float = 10.0,
         outputs: Sequence[str] = USUAL_OUTPUTS,
         rolling: Rolling | None = None,
+        n_sweeps: int | None = None,
         lifecycle: bool = False,
     ) -> None:
         if frame_id is not None:
@@ -142,6 +152,14 @@ class PerceptionNode:
         self._closed = threading.Event()
         self._tracker, self._rolling, self._poses = tracker, rolling, Poses(self._messages)
         self._forgets = False  # the next cloud begins anew
+        self._swept: SweepPerceiver | None = None
+        self._n_sweeps, self._odometry = n_sweeps, None
+        self._mounting: Mounting | None = None  # that of the last cloud
+        if n_sweeps is not None:
+            OPTIONS.whole("n_sweeps", n_sweeps, 2, MAX_SWEEPS)
+            if tracker is None:
+                raise OptionError("n_sweeps needs a tracker, to tell what stands: pass tracker=Tracker()")
+            self._odometry = Odometry() if rolling is None else None
 
         self._topics = _topics_of(outputs, prefix, rolling is not None)
         received = [topic, *([] if rolling is None else [rolling.topic])]
@@ -199,7 +217,8 @@ class PerceptionNode:
             if transition == "configure":
                 self._connect()
             elif transition == "cleanup":
-                self._perceiver, self._newest, self._error, self._forgets = None, None, None, True
+                self._perceiver, self._swept, self._mounting = None, None, None
+                self._newest, self._error, self._forgets = None, None, True
                 self._gather_s = 0.0
                 self._recent.clear()
             self._state = possible[transition]
@@ -283,6 +302,8 @@ class PerceptionNode:
                 self._tracker.reset()
             if self._rolling is not None:
                 self._rolling.grid.reset()
+            if self._odometry is not None:
+                self._odometry.reset()
         if len(data) > MAX_SCAN_BYTES:
             raise PointsError(f"the cloud has {len(data):,} bytes; expected at most {MAX_SCAN_BYTES:,}")
         cloud = self._messages.decode(data, messages.CLOUD)
@@ -295,6 +316,8 @@ class PerceptionNode:
         perceiver = self._perceiver
         if perceiver is None:
             perceiver = self._perceiver = self._perceiver_for(describe_cloud(self._topic, cloud))
+            if self._n_sweeps is not None and self._tracker is not None:
+                self._swept = SweepPerceiver(perceiver, self._tracker, self._odometry or self._placed, self._n_sweeps)
             self._cloud_frame = cloud.header.frame_id
             if (pattern := perceiver.sensor.pattern) is not None:
                 self._recent.append((time.time_ns(), data))
@@ -310,26 +333,33 @@ class PerceptionNode:
             earlier = [*self._earlier(data, stamp_ns, self._gather_s)]
             self._n_earlier = sum(map(len, earlier))
             points = np.concatenate([*earlier, points])
-        perception = perceiver(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
-        self._points, self._stamp_ns, self._cloud, self._sensor = points, stamp_ns, cloud, perceiver.sensor
-        if self._rolling is not None:
-            self._place(self._rolling, perception.mounting)
+        self._pose, self._cloud, self._stamp_ns = None, cloud, stamp_ns
+        perception = (self._swept or perceiver)(points, stamp_s=Stamp(stamp_ns * 1e-9, stamp_ns))
+        self._points, self._sensor, self._mounting = points, perceiver.sensor, perception.mounting
+        if self._rolling is not None and self._pose is None:
+            self._pose = self._pose_at(self._rolling, perception.mounting)
+            self._n_unplaced += self._pose is None
         return perception
 
-    def _place(self, rolling: Rolling, mounting: Mounting) -> None:
-        """Set the pose of the cloud; without one, count it."""
+    def _placed(self, points: ArrayLike, stamp_s: float) -> Floats | None:
+        """Pose of the cloud before it is perceived: the sensor is mounted as in the one before."""
+        if self._rolling is not None and self._mounting is not None:
+            self._pose = self._pose_at(self._rolling, self._mounting)
+        return self._pose
+
+    def _pose_at(self, rolling: Rolling, mounting: Mounting) -> Floats | None:
         assert self._stamp_ns is not None
         pose = self._poses.at(self._stamp_ns)
         if pose is None:
             self._unplaced = "no pose at the time of the cloud"
-        else:
-            frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
-            pose = pose @ rolling.base_from_sensor(*frames, mounting)
-        self._pose = pose
-        self._n_unplaced += pose is None
+            return None
+        frames = self._poses.child_frame_id, str(self._cloud.header.frame_id)
+        return pose @ rolling.base_from_sensor(*frames, mounting)
 
     def _track(self, perception: Perception) -> Tracks | None:
         """The tracks; None with an odometry that has no pose of the cloud, without which they would begin anew."""
+        if self._swept is not None:
+            return self._swept.track(perception)
         assert self._tracker is not None
         if self._rolling is not None and self._pose is None:
             return None

@@ -21,7 +21,8 @@ from .messages import RosMessages
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TOLERANCE_S = 0.2
-"""A cloud may be newer than the newest pose by this; then the newest one is taken."""
+"""A cloud may be newer than the newest pose by this; then the motion of the last `MOTION_S` is taken to go on."""
+MOTION_S = 0.1
 _MOST = 1000  # poses that are kept; 5 s at 200 Hz
 _FARTHEST_M = 9e7  # the sensor, which is beside, is within what trackers and grids take
 
@@ -94,11 +95,17 @@ class Poses:
             self.frame_id, self.child_frame_id = message.header.frame_id, message.child_frame_id
 
     def at(self, stamp_ns: int) -> Floats | None:
-        """Pose (4, 4) of the child frame at a time, between the two around it; None if there is none."""
+        """Pose (4, 4) of the child frame at a time, between the two around it or after the newest; None if there is
+        none.
+        """
         with self._lock:
             k = bisect.bisect_right(self._poses, stamp_ns, key=itemgetter(0))  # the first that is later
             if k == 0 or (k == len(self._poses) and stamp_ns - self._poses[-1][0] > TOLERANCE_S * 1e9):
                 return None
-            (ns, place, turn), (later_ns, later_place, later_turn) = (*self._poses[k - 1 : k + 1], self._poses[-1])[:2]
+            before, later = self._poses[k - 1], self._poses[min(k, len(self._poses) - 1)]
+            if before is later:
+                j = bisect.bisect_right(self._poses, later[0] - round(MOTION_S * 1e9), key=itemgetter(0))
+                before = self._poses[max(j - 1, 0)]
+        (ns, place, turn), (later_ns, later_place, later_turn) = before, later
         share = (stamp_ns - ns) / (later_ns - ns) if later_ns > ns else 0.0
         return pose_between((place, turn), (later_place, later_turn), share)

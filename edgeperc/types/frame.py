@@ -117,7 +117,9 @@ def poses_of(positions: Floats, quaternions: Floats) -> Floats:
 
 
 def pose_between(first: tuple[Floats, Floats], second: tuple[Floats, Floats], share: float) -> Floats:
-    """Matrix (4, 4) at a share of the way between two poses: positions (3,) and unit quaternions x, y, z, w (4,)."""
+    """Matrix (4, 4) at a share of the way between two poses, or after it for a share above 1: positions (3,) and unit
+    quaternions x, y, z, w (4,).
+    """
     (place, turn), (later_place, later_turn) = first, second
     near = later_turn if turn @ later_turn >= 0.0 else -later_turn
     turned = (1.0 - share) * turn + share * near

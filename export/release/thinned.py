@@ -69,12 +69,11 @@ def row_of_drive(kitti: KittiObjects, drive: str, sensor: str, n: int) -> str:
         frame, stamp_s, pose, earlier = kitti.frame(name), 0.1 * k, None, None
         points = frame.points if sensor == DEFAULT_SENSOR else thinned(frame, profile).points
         if odometry is not None and sweeps is not None:
-            pose = odometry(points)
+            pose = odometry(points, stamp_s)
             earlier = sweeps.earlier(points, stamp_s, pose)
         perception = perceive(points, stamp_s, earlier=earlier)
-        tracks = tracker(perception, pose)
-        if odometry is not None and sweeps is not None and odometry.is_settled:
-            sweeps.add(points, perception, tracks)
+        if sweeps is not None and pose is not None:
+            sweeps.add(points, perception, tracker(perception, pose))
         front = kitti_truth(frame, None).front
         if front is not None:
             counts += count_in_image(front, perception.boxes, drive)

@@ -662,6 +662,10 @@ def test_sweeps_come_with_the_next_scans(tmp_path: Path, shell: Shell) -> None:
     shell.out("run", tmp_path / "0", tmp_path / "1", "--track", "--sweeps", 3)
     assert [bool(n) for n in FakePerceiver.n_earlier] == 2 * [*[False] * 4, True, True]
     FakePerceiver.n_earlier.clear()
+    answers = shell.records("run", tmp_path / "0", "--track", "--sweeps", 3, "--live", "--rate", 2)
+    assert [bool(n) for n in FakePerceiver.n_earlier] == [*[False] * 4, True, True]
+    assert [answer["tracks_late"] for answer in answers] == [*[None] * 3, False, False, False]
+    FakePerceiver.n_earlier.clear()
     shell.out("run", tmp_path / "0", "--track")
     assert FakePerceiver.n_earlier == [None] * 6
 
@@ -727,7 +731,6 @@ def test_wrong_usage(tmp_path: Path, shell: Shell, fake: type[FakePerceiver]) ->
         (("--deskew",), "--deskew needs --poses FILE or --track"),
         (("--poses", scan), "--poses needs --deskew"),
         (("--sweeps", "5"), "--sweeps needs --track"),
-        (("--sweeps", "5", "--track", "--live"), "and no --live"),
         (("--sweeps", "21", "--track"), "--sweeps is 21; expected 2 to 20"),
         (("--deskew", "--track", "--live"), "and no --live"),
     ]:

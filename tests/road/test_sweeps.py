@@ -23,6 +23,7 @@ from edgeperc import (
     PointsError,
     SensorHealth,
     StampError,
+    SweepPerceiver,
     Sweeps,
     Tracker,
     TrackingError,
@@ -157,6 +158,42 @@ def test_a_jump_of_the_clock_begins_anew() -> None:
         sweeps.add(wall(10.0), perceived(wall(10.0)), tracker.update([], 999.0 - 500.0, moved(0.0)))
     assert len(sweeps.earlier(wall(10.0), 499.1, moved(0.0))) == len(wall(10.0))
     assert not len(sweeps.earlier(wall(10.0), 1000.1, moved(0.0)))  # of the clock before
+
+
+def test_a_scan_without_a_pose_forgets_those_before() -> None:
+    sweeps, _ = remembered((wall(10.0), []))
+    assert len(sweeps.earlier(wall(10.0), 0.1, moved(0.0)))
+    assert not len(sweeps.earlier(wall(10.0), 0.1, None))
+    assert not len(sweeps.earlier(wall(10.0), 0.1, moved(0.0)))
+
+
+def test_a_perceiver_gets_the_scans_before() -> None:
+    """Those whose poses are known; a scan without a pose, or without a time, has no tracks."""
+    given: list[NDArray[np.float32]] = []
+    poses = iter([moved(0.0), moved(1.0), None, moved(3.0), moved(4.0)])
+
+    def perceiver(points: NDArray[np.float32], stamp_s: float, earlier: NDArray[np.float32]) -> Perception:
+        given.append(earlier)
+        return perceived(points, stamp_s=stamp_s)
+
+    def odometry(points: Any, stamp_s: float) -> NDArray[np.float64] | None:
+        if not math.isfinite(stamp_s):
+            raise StampError(f"got a scan at {stamp_s} s")
+        return next(poses)
+
+    perceive = SweepPerceiver(perceiver, Tracker(), odometry, n=3)
+    tracked = [perceive.track(perceive(wall(10.0 - k), 0.1 * k)) for k in range(5)]
+    assert [each is None for each in tracked] == [False, False, True, False, False]
+    assert [bool(len(earlier)) for earlier in given] == [False, True, False, False, True]
+    np.testing.assert_allclose(given[1][:, 0], 9.0)
+    np.testing.assert_allclose(given[4][:, 0], 6.0)
+    untimed = perceive(wall(5.0), math.nan)
+    assert not len(given[-1])
+    with pytest.raises(StampError, match="nan"):
+        perceive.track(untimed)
+    assert perceive.sensor is None
+    with pytest.raises(OptionError, match="from 2 to 20"):
+        SweepPerceiver(perceiver, Tracker(), odometry, n=1)
 
 
 @pytest.mark.parametrize(

@@ -439,6 +439,35 @@ def test_the_grid_with_memory_and_the_tracks_follow_the_odometry(quick: None) ->
         assert grid.info.origin.position.z == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("poses", ["topic", "scans"])
+def test_earlier_clouds_lie_where_the_newest_has_them(poses: str) -> None:
+    """A wall 12 m ahead, to which the vehicle drives; the second cloud is the first whose place is known in time."""
+    if poses == "scans":
+        pytest.importorskip("kiss_icp", reason="the extra slam is not installed")
+    points, perceive, n = street(), Perceive(), 6
+    options = {"rolling": Rolling(sensor_pose=(0.0,) * 6)} if poses == "topic" else {}
+    with running(perceive, n_sweeps=3, tracker=Tracker(), **options) as (graph, node, outcomes):
+        for k in range(n):
+            stamp_ns, moved = 10**9 + k * 10**8, points - np.float32([0.3 * k, 0.0, 0.0, 0.0])
+            if poses == "topic":
+                graph.odometry(odometry(stamp_ns, 0.3 * k, 0.0, 0.0))
+            graph.give(cloud(moved, stamp_ns))
+            answer = next(outcomes)
+            alone = 2 if poses == "topic" else 4
+            assert bool(len(perceive.earlier[k])) == (k >= alone)
+            assert (answer.tracks is not None) == (k >= alone - 1)
+        if poses == "topic":
+            ahead = perceive.earlier[-1][
+                (np.abs(perceive.earlier[-1][:, 1]) < 2.5) & (perceive.earlier[-1][:, 0] > 9.0)
+            ]
+            np.testing.assert_allclose(ahead[ahead[:, 2] > -1.4, 0], 12.1 - 0.3 * (n - 1), atol=1e-3)
+        for change in ("deactivate", "cleanup", "configure", "activate"):
+            node.change_state(change)
+        graph.give(cloud(moved, stamp_ns + 10**8))
+        next(outcomes)
+        assert not len(perceive.earlier[-1])
+
+
 def test_a_life_in_states(quick: None) -> None:
     graph, made, tracker = FakeGraph(), [], Tracker()
 
@@ -574,6 +603,8 @@ def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
         ({"topic": "mine", "outputs": ("points=/here/mine",)}, "share the topic /here/mine;"),
         ({"rate_hz": 0.0}, "rate_hz is 0"),
         ({"rate_hz": math.nan}, "rate_hz is nan"),
+        ({"n_sweeps": 1}, "n_sweeps is 1; expected a whole number from 2 to 20"),
+        ({"n_sweeps": 5}, "n_sweeps needs a tracker"),
     ],
 )
 def test_options_of_no_node(options: dict[str, Any], said: str) -> None:

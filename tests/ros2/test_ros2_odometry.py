@@ -40,9 +40,23 @@ def test_times_without_a_pose() -> None:
     for k in range(3):
         poses.receive(odometry(10**9 + k * 10**8, float(k), 0.0, 0.0))
     assert poses.at(10**9 - 1) is None
-    for stamp_ns, x in ((10**9, 0.0), (1_200_000_000, 2.0), (1_400_000_000, 2.0)):
-        assert poses.at(stamp_ns)[0, 3] == x
+    for stamp_ns, x in ((10**9, 0.0), (1_200_000_000, 2.0), (1_400_000_000, 4.0)):  # which goes on as before
+        assert poses.at(stamp_ns)[0, 3] == pytest.approx(x)
     assert poses.at(1_400_000_001) is None
+
+
+@pytest.mark.parametrize("every_s", [0.005, 0.1])
+def test_after_the_newest_pose_the_motion_of_the_last_tenth_of_a_second_goes_on(every_s: float) -> None:
+    """Not that between the last two poses, which a fast odometry knows to a few millimeters alone."""
+    poses, n = Poses(MESSAGES), round(0.4 / every_s)
+    for k in range(n + 1):
+        jitter_m = 0.002 * (k % 2)
+        poses.receive(
+            odometry(10**18 + round(k * every_s * 1e9), 10.0 * k * every_s + jitter_m, 0.0, 0.5 * k * every_s)
+        )
+    pose = poses.at(10**18 + 550_000_000)
+    np.testing.assert_allclose(pose[:2, 3], [5.5, 0.0], atol=0.01)
+    assert math.atan2(pose[1, 0], pose[0, 0]) == pytest.approx(0.5 * 0.55, abs=1e-3)
 
 
 def test_a_recording_that_begins_again() -> None:
