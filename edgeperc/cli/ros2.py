@@ -142,12 +142,12 @@ def ros2_command(arguments: argparse.Namespace) -> int:
     from ..tracking.tracker import Tracker
     from ..zoo import resolve
 
+    if arguments.sweeps is not None and arguments.no_track:
+        arguments.usage_error("--sweeps needs tracks, to tell what stands; leave out --no-track")
     graph = _open_graph(arguments)
     try:
         _take_parameters(graph, arguments)
         check_sensor(arguments)
-        if arguments.sweeps is not None and arguments.no_track:
-            raise OptionError("--sweeps needs tracks, to tell what stands; leave out --no-track")
         for model in chosen_models(arguments):  # no cloud heals a wrong name, and the first may come late
             resolve(model)
         made = [] if arguments.sensor is None else [_perceiver(arguments, arguments.sensor)]

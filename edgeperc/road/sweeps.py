@@ -274,15 +274,21 @@ def _leveling(ground: Points, height_m: Floats32) -> Floats:
     places = np.column_stack([ground[near, :2], np.ones(np.count_nonzero(near))]).astype(np.float64)
     heights, kept = height_m[near].astype(np.float64), np.ones(len(places), np.bool_)
     for _ in range(3):
-        a, b, c = np.linalg.lstsq(places[kept], heights[kept], rcond=None)[0].tolist()
+        of_kept = places[kept]
+        a, b, c = np.linalg.lstsq(of_kept.T @ of_kept, of_kept.T @ heights[kept], rcond=None)[0].tolist()
         off_m = np.abs(heights - places @ (a, b, c))
-        kept = off_m < max(3.7 * float(np.median(off_m[kept])), 0.03)  # 2.5 standard deviations
-    if np.median(off_m) > GAIN * np.median(np.abs(heights)):
+        kept = off_m < max(3.7 * _median(off_m[kept]), 0.03)  # 2.5 standard deviations
+    if _median(off_m) > GAIN * _median(np.abs(heights)):
         return leveling
     leveling[:3, :3] = [[1.0, 0.0, a], [0.0, 1.0, b], [-a, -b, 1.0]]
     leveling[:3, :3] /= np.linalg.norm(leveling[:3, :3], axis=0)
     leveling[2, 3] = -c
     return leveling
+
+
+def _median(values: Floats) -> float:
+    """The upper one of the two in the middle; `np.median` takes 0.1 ms, and 45 of them are needed for a scan."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
 def _stands(track: Track) -> bool:
@@ -311,11 +317,11 @@ def mark_still_there(scan: Points, earlier: Points, eye: Floats, step: Floats, b
         for k in range(-1, 2):
             n_sides = 0
             for side in (-1, 1):
-                for away in range(3):
+                for away in range(3 if is_passed else 0):  # most points are not passed, by the first beam that tells
                     j = row + side * away
                     if 0 <= j < n_rows and nearest[(column + k) % n_columns, j] < np.inf:
                         n_sides += 1
-                        is_passed &= nearest[(column + k) % n_columns, j] > range_m + beyond_m
+                        is_passed = nearest[(column + k) % n_columns, j] > range_m + beyond_m
                         break
             n_open += n_sides == 2
         is_there[i] = not (is_passed and n_open > 0)

@@ -470,6 +470,7 @@ def test_what_rclpy_refuses(bus: Bus, options: dict[str, Any], said: str, monkey
         ({"model": ["nothing"]}, "no model is called 'nothing'"),
         ({"topic": "/other", "rate": 20.0, "sensor": "no such sensor"}, "no such sensor"),
         ({"rate": 20}, "the parameter rate is not of type float"),
+        ({"sweeps": 30}, "n_sweeps is 30; expected a whole number from 2 to 20"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:no detections are published")
@@ -498,10 +499,12 @@ def test_parameters_make_the_grid_with_memory(bus: Bus, made: list[Any]) -> None
         "sensor_pose": [1.0, 0.0, 1.5, 0.0, 0.0, 90.0],
         "grid_size": 20.0,
         "publish": ["rolling=/grid", "ground_points"],
+        "sweeps": 5,
     }
     assert main(["ros2", "--rclpy", "--lifecycle"]) == 2
     ((_, options),) = made
     assert (options["outputs"], options["lifecycle"]) == (["rolling=/grid", "ground_points"], True)
+    assert options["n_sweeps"] == 5
     rolling = options["rolling"]
     assert (rolling.topic, rolling.sensor_pose) == ("/odometry/filtered", [1.0, 0.0, 1.5, 0.0, 0.0, 90.0])
     assert rolling.grid.values().shape == (100, 100)
@@ -552,6 +555,7 @@ def test_the_grid_with_memory_over_zenoh(router: str, watch: Watch) -> None:
         (["--ros-args", "-r", "a:=b"], "--ros-args needs --rclpy"),
         (["--rclpy", "--connect", "tcp/localhost:1"], "--connect needs Zenoh"),
         (["--lifecycle"], "--lifecycle needs --rclpy"),
+        (["--sweeps", "5", "--no-track"], "--sweeps needs tracks"),
     ],
 )
 def test_options_that_exclude_one_another(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
