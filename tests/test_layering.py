@@ -74,6 +74,7 @@ FLOORS = {
         road.ahead road.grid
         road.rolling road.sweeps
         pipeline
+        readers.units
         readers.__init__ readers.origin readers.pcap readers.ports readers.scan_odometry readers.times readers.unknown
         readers.clouds readers.images readers.ouster readers.packets readers.tables
         readers.alternation readers.livox_packets readers.mems_packets readers.ouster_packets readers.spinning_packets

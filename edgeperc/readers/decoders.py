@@ -178,7 +178,7 @@ def _packet_scans(kind: str, job: _Job) -> Iterator[TimedScan]:
                 yield from _pcap_scans(job)
                 is_told = False
             except PointsError as exc:  # of a sensor that starts, or of another program
-                listen(job.path).begun = []
+                listen(job.path).forget()
                 if not is_told:
                     job.say(f"no scans for now, and edgeperc waits: {exc}")
                 is_told = True

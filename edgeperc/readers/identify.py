@@ -98,14 +98,15 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
         return None
     if lidar.row is None:
         raise of_livox()
-    from .lidars import columns_of, open_spinning, payloads_of  # numba
+    from .lidars import columns_of, open_spinning, payloads_of, unit_at  # numba
     from .spinning_packets import Format
 
     if not isinstance(lidar.row, Format) or not lidar.row.spins:
         return of_model(lidar.row.name)
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
-    row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None))
+    unit = unit_at(path, sender or lidar.first)
+    row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None), unit)
     return of_spinning(row.name, angles.lasers_deg.tolist(), columns_of(row, payloads_of(path, sender, lambda: None)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -30,15 +31,18 @@ from .spinning_packets import (
     read_angles,
 )
 from .times import TimedScan
+from .units import hesai_calibration
 
 _STEPS = 200  # packets that show how far apart columns are
 _ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
 Opened = tuple[SpinningStream | MemsStream | MirrorStream, Callable[[memoryview], bool]]
 
 
-def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tuple[Format, Angles]:
+def open_spinning(
+    path: Path, row: Format, payloads: Iterable[memoryview], unit: str | None = None
+) -> tuple[Format, Angles]:
     """The format and angles of a spinning sensor; PointsError if neither its packets nor a file beside the capture has
-    them.
+    them, nor the sensor itself tells them, where it is at an address now.
     """
     file = _file_of(path, ".csv")
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
@@ -50,6 +54,9 @@ def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tu
             break
     if file is not None and (said is None or row.elevations_deg):
         return row, read_angles(file, row)
+    if said is None and row.is_hesai and unit is not None:
+        with _asked(f"the angles of the lasers of this {row.title} are not known", path, ".csv"):
+            return row, read_angles(hesai_calibration(unit), row)
     if said is None:
         there = "" if row.is_hesai else "There is no packet with the angles (DIFOP, port 7788). "
         if there and is_port(path):
@@ -60,6 +67,23 @@ def open_spinning(path: Path, row: Format, payloads: Iterable[memoryview]) -> tu
             f"{named(path).stem}.csv"
         )
     return row, said
+
+
+@contextmanager
+def _asked(unknown: str, path: Path, suffix: str) -> Iterator[None]:
+    """Say what to do where a live sensor does not answer, or what is of no use."""
+    try:
+        yield
+    except PointsError as exc:
+        raise PointsError(
+            f"{unknown}. {exc}. Save the calibration of the unit from its web page into the current folder, as "
+            f"{named(path).stem}{suffix}"
+        ) from exc
+
+
+def unit_at(path: Path, sender: str) -> str | None:
+    """Where a sender, an address with or without its port, can be asked: at ports, for it is there now."""
+    return sender.partition(":")[0] if is_port(path) else None
 
 
 def _file_of(path: Path, suffix: str) -> Path | None:
@@ -106,19 +130,22 @@ def _known_format(payload: memoryview) -> Format | MemsFormat | None:
     return row
 
 
-def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview]) -> Opened:
+def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview], unit: str | None = None) -> Opened:
     """What makes scans of the packets of a format, and tells them from others; PointsError as of `open_spinning`."""
     if isinstance(row, MemsFormat):
         return MemsStream(row), lambda payload: mems_format_of(payload) is row
     if not row.spins:
         file = _file_of(path, ".dat")
+        if file is None and unit is not None:
+            with _asked(f"where the lasers of this {row.title} look is not known", path, ".dat"):
+                return MirrorStream(row, read_mirrors(hesai_calibration(unit))), partial(is_of, row)
         if file is None:
             raise PointsError(
                 f"where the lasers of this {row.title} look is not known. Put the correction file of the unit beside "
                 f"it, as {named(path).stem}.dat"
             )
         return MirrorStream(row, read_mirrors(file)), partial(is_of, row)
-    found, angles = open_spinning(path, row, units)
+    found, angles = open_spinning(path, row, units, unit)
     return SpinningStream(found, angles), partial(is_of, found)
 
 
@@ -148,7 +175,7 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     """
     first = sender or lidar.first
     if lidar.row is not None:
-        stream, is_of_sensor = open_stream(path, lidar.row, payloads_of(path, sender, alive))
+        stream, is_of_sensor = open_stream(path, lidar.row, payloads_of(path, sender, alive), unit_at(path, first))
         for payload in payloads_of(path, first, alive, endless=True):
             if is_of_sensor(payload):
                 yield from stream.add(payload)

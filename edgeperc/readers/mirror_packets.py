@@ -18,6 +18,7 @@ from ..types.points import Floats, Ints64
 from .packets import Newest
 from .spinning_packets import Format, time_of
 from .times import TimedScan
+from .units import Told
 
 _DEGREE = 25_600
 _TURN = 360 * _DEGREE
@@ -46,7 +47,7 @@ class Mirrors(NamedTuple):
         return -1
 
 
-def read_mirrors(path: Path) -> Mirrors:
+def read_mirrors(path: Path | Told) -> Mirrors:
     """Raises PointsError: It is not the correction file of an AT128, of version 1.5."""
     content = path.read_bytes()[: 1 << 20]
     begin = max(content.find(b"\xee\xff"), 0)

@@ -6,7 +6,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,30 +14,48 @@ from typing import Any
 import numpy as np
 
 from ..errors import PointsError
-from .ports import named
+from .ports import is_port, listen, named
+from .units import Told, ouster_metadata
 
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
 _MOST_JSON_BYTES = 1 << 24
+_OTHERS_BYTES = 1500  # other sensors' packets fit into a frame of Ethernet; an Ouster's have 2,304 bytes and more
 
 
-def metadata_beside(path: Path) -> list[Path]:
+def metadata_beside(path: Path) -> Sequence[Path | Told]:
     """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses, but
-    for sensor profiles, which `edgeperc info --write` may have put there.
+    for sensor profiles, which `edgeperc info --write` may have put there. Without one, a live sensor is asked.
     """
     alike: dict[int, list[Path]] = {}
-    path = named(path)
-    for file in sorted(path.absolute().parent.iterdir()):
-        n = len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
+    name = named(path).name
+    for file in sorted(named(path).absolute().parent.iterdir()):
+        n = len(os.path.commonprefix([file.name, name]))  # noqa: RUF071 - of the characters
         if n and file.suffix.lower() == ".json" and file.is_file():
             alike.setdefault(n, []).append(file)
     for n in sorted(alike, reverse=True):
         if files := [file for file in alike[n] if not _is_profile(file)]:
             return files
+    told = _told(path) if is_port(path) else []
+    if found := [each for each in told if isinstance(each, Told)]:
+        return found
     raise PointsError(
         "no points of a LiDAR that is known (one that starts sends none), unless they are an Ouster's: there is no "
-        "metadata next to it. Expected a .json file whose name has the same beginning"
+        f"metadata next to it. {''.join(f'{exc}. ' for exc in told)}"
+        "Expected a .json file whose name has the same beginning"
     )
+
+
+def _told(port: Path) -> list[Told | PointsError]:
+    """What each sensor says whose packets are as long as an Ouster's alone."""
+    listener = listen(port)
+    for sender in dict.fromkeys(each.sender for each in listener.begun if len(each.payload) > _OTHERS_BYTES):
+        if sender not in listener.told:
+            try:
+                listener.told[sender] = ouster_metadata(sender)
+            except PointsError as exc:
+                listener.told[sender] = exc
+    return [*listener.told.values()]
 
 
 def _is_profile(file: Path) -> bool:
@@ -45,9 +63,9 @@ def _is_profile(file: Path) -> bool:
     return file.stat().st_size <= _MOST_JSON_BYTES and b'"elevations_deg"' in file.read_bytes()
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path | Told) -> dict[str, Any]:
     """The text of a sensor's metadata, once it is checked."""
-    if path.stat().st_size > _MOST_JSON_BYTES:
+    if isinstance(path, Path) and path.stat().st_size > _MOST_JSON_BYTES:
         raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")
     with reading(f"the metadata {path.name}"):
         try:

@@ -17,6 +17,8 @@ from ..errors import PointsError
 if TYPE_CHECKING:
     import socket
 
+    from .units import Told
+
 _SOURCE = re.compile(r"udp:/{0,2}(?:(\d+(?:\.\d+){3})?:)?(\d{1,5}(?:,\d{1,5})*)")
 _MOST_BYTES = 65_535
 _BUFFER_BYTES = 1 << 23  # of the system, for packets that nobody has taken yet; it may give fewer
@@ -77,6 +79,7 @@ class Listener:
         if not ports or not all(0 < port < 65_536 for port in ports):
             raise PointsError("expected ports as udp:2368, udp:6699,7788 or udp:ADDRESS:2368")
         self.begun = list[Datagram]()  # the first packets of the run that goes on
+        self.told = dict[str, "Told | PointsError"]()  # what sensors said in this run, by address
         self._waiting, self._changed = deque[Datagram](), threading.Condition()
         self._is_new, self._is_late, self._closed = True, False, threading.Event()
         self._sockets, self._threads = list["socket.socket"](), list[threading.Thread]()
@@ -131,7 +134,12 @@ class Listener:
         yield from self.first(alive)
         while (datagram := self.take(SILENCE_S)) is not None:
             yield datagram
-        self.begun, self._is_late = [], False
+        self.forget()
+        self._is_late = False
+
+    def forget(self) -> None:
+        """Begin another run, maybe of another sensor."""
+        self.begun, self.told = [], {}
 
     def take(self, wait_s: float) -> Datagram | None:
         """The next packet; None if none comes in time, or if some were dropped in this run."""

@@ -19,6 +19,7 @@ from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints64, Points
 from .packets import DIFOP, Newest
 from .times import TimedScan
+from .units import Told
 
 
 class Clock(NamedTuple):
@@ -267,7 +268,7 @@ def has_16_lasers(payload: memoryview) -> bool:
     return bool((others[:, 0] == 255).all() or not others.any())
 
 
-def read_angles(path: Path, row: Format) -> Angles:
+def read_angles(path: Path | Told, row: Format) -> Angles:
     """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or, without channel, RoboSense's."""
     n = row.lasers or row.n_channels
     rows = []

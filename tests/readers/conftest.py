@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import cycle, takewhile
 from pathlib import Path
 from typing import Any
 
 import pytest
+from lidar_writers import Sender
 
 
 @pytest.fixture
@@ -56,3 +60,18 @@ def source(port: int) -> Iterator[Path]:
 
     yield (path := Path(f"udp:{port}"))
     ports.release(path)
+
+
+@pytest.fixture
+def send(port: int) -> Iterator[Sender]:
+    """Sends packets again and again, 2,000 a second."""
+    over = threading.Event()
+
+    def run(packets: Sequence[bytes]) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            for packet in takewhile(lambda _: not over.wait(0.0005), cycle(packets)):
+                one.sendto(packet, ("127.0.0.1", port))
+
+    with ThreadPoolExecutor() as pool:
+        yield lambda packets: pool.submit(run, packets)
+        over.set()

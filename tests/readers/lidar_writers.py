@@ -6,7 +6,7 @@ No real captures of these sensors are among the tests' data.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from edgeperc.simulation.samples import simulated_scan
 
 T0_S = 1_750_000_000
+Sender = Callable[[Sequence[bytes]], object]
+"""Sends packets to a port again and again."""
 
 
 @dataclass(frozen=True)

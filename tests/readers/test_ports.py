@@ -3,40 +3,21 @@
 from __future__ import annotations
 
 import socket
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from itertools import cycle, islice, takewhile
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_writers import write_pcap
-from lidar_writers import MODELS, blocks_of, calibration, difop, packets_of, ranges, unit_angles
+from lidar_writers import MODELS, Sender, blocks_of, calibration, difop, packets_of, ranges, unit_angles
 
 from edgeperc import PointsError, read_timed_scans, sensor_of, stream
 from edgeperc.readers import ports
 from edgeperc.readers.packets import Datagrams
 
-Sender = Callable[[Sequence[bytes]], object]
 MODEL = MODELS["pandar40p"]
-
-
-@pytest.fixture
-def send(port: int) -> Iterator[Sender]:
-    """Sends packets again and again, 2,000 a second."""
-    over = threading.Event()
-
-    def run(packets: Sequence[bytes]) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-            for packet in takewhile(lambda _: not over.wait(0.0005), cycle(packets)):
-                one.sendto(packet, ("127.0.0.1", port))
-
-    with ThreadPoolExecutor() as pool:
-        yield lambda packets: pool.submit(run, packets)
-        over.set()
 
 
 def silent() -> None:
