@@ -4,7 +4,7 @@ Run as ``python -m edgeperc_export.release.thinned KITTI [--sensors vlp-16] [--m
 HDL-64E's beams, those nearest to the sensor's remain, with its columns; its range, noise and remission stay, and none
 looks up by more than 2 degrees. Prints a table of Markdown: of the network alone, and of the whole answer, with
 its boxes. ``--drives 0001`` takes the labeled scans of drives instead, each alone and with the points of the last
-``--sweeps`` scans (`edgeperc.Sweeps`), at the poses that KISS-ICP finds in the thinned scans (extra ``slam``).
+``--sweeps`` scans (`edgeperc.SweepPerceiver`), at the poses that KISS-ICP finds in the thinned scans (extra ``slam``).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgeperc import Odometry, Perceiver, Sweeps, Tracker
+from edgeperc import Odometry, Perceiver, SweepPerceiver, Tracker
 from edgeperc.datasets.kitti import Frame, KittiObjects
 from edgeperc.evaluation.judge import BY_DEFAULT, NETWORK_ALONE, Judge
 from edgeperc.evaluation.kitti_ap import average_precisions, count_in_image
-from edgeperc.evaluation.metrics import Listed
+from edgeperc.evaluation.metrics import Confusion, Listed
 from edgeperc.evaluation.tables import figures
 from edgeperc.evaluation.truth import kitti_truth
 from edgeperc.simulation.scene import POINT_CLASSES
@@ -61,26 +61,29 @@ def row_of(kitti: KittiObjects, model: str, sensor: str, whole: bool) -> str:
 
 
 def row_of_drive(kitti: KittiObjects, drive: str, sensor: str, n: int) -> str:
-    """AP of cars and cyclists in a drive, R40 [%], by the last ``n`` scans; ``hdl-64e`` is not thinned."""
+    """AP of cars and cyclists in a drive, R40, and IoU of points [%], by the last ``n`` scans; ``hdl-64e`` is not
+    thinned.
+    """
     profile = get_sensor(sensor) if sensor == DEFAULT_SENSOR else profile_of(sensor)
-    perceive, tracker, counts = Perceiver(sensor=profile, on_mismatch="ignore"), Tracker(), Listed()
-    sweeps, odometry = (Sweeps(n), Odometry()) if n > 1 else (None, None)
+    alone, counts, labels = Perceiver(sensor=profile, on_mismatch="ignore"), Listed(), Confusion(POINT_CLASSES)
+    follow = SweepPerceiver(alone, Tracker(), Odometry(), n) if n > 1 else None
     for k, name in enumerate(name for name in kitti.grades if kitti.drives[name].endswith(drive)):
-        frame, stamp_s, pose, earlier = kitti.frame(name), 0.1 * k, None, None
-        points = frame.points if sensor == DEFAULT_SENSOR else thinned(frame, profile).points
-        if odometry is not None and sweeps is not None:
-            pose = odometry(points, stamp_s)
-            earlier = sweeps.earlier(points, stamp_s, pose)
-        perception = perceive(points, stamp_s, earlier=earlier)
-        if sweeps is not None and pose is not None:
-            sweeps.add(points, perception, tracker(perception, pose))
+        frame, stamp_s = kitti.frame(name), 0.1 * k
+        seen = frame if sensor == DEFAULT_SENSOR else thinned(frame, profile)
+        if follow is None:
+            perception = alone(seen.points, stamp_s)
+        else:
+            perception = follow(seen.points, stamp_s)
+            follow.track(perception)
+        labels.update(perception.require_points().labels, seen.point_labels())
         front = kitti_truth(frame, None).front
         if front is not None:
             counts += count_in_image(front, perception.boxes, drive)
     found = {rule: 100.0 * average_precisions(of)[0] for rule, of in counts.items()}
     of_cars = [(measure, "moderate") for measure in ("bird's eye 0.5", "bird's eye 0.7", "3-D 0.7")]
     cars = [f"{found['car', measure, part]:.1f}" for measure, part in (*of_cars, ("bird's eye 0.5", "30-45 m"))]
-    return f"{n} | {' / '.join(cars)} | {found['cyclist', '3-D 0.5', 'moderate']:.1f}"
+    of_points = " / ".join(f"{100.0 * iou:.1f}" for iou in labels.iou()[1:])
+    return f"{n} | {' / '.join(cars)} | {found['cyclist', '3-D 0.5', 'moderate']:.1f} | {of_points}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -95,9 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.drives:
         print(
-            "| drive | sensor | scans | AP of cars: bird's eye 0.5 / 0.7 / 3-D 0.7 / 30-45 m | of cyclists: 3-D 0.5 |"
+            "| drive | sensor | scans | AP of cars: bird's eye 0.5 / 0.7 / 3-D 0.7 / 30-45 m | of cyclists: 3-D 0.5 "
+            "| IoU of points of cars / pedestrians / cyclists |"
         )
-        print("|---|---|---|---|---|")
+        print("|---|---|---|---|---|---|")
         for drive, sensor, n in itertools.product(given.drives, given.sensors, given.sweeps):
             print(f"| {drive} | {sensor} | {row_of_drive(KittiObjects(given.kitti), drive, sensor, n)} |", flush=True)
         return

@@ -149,5 +149,8 @@ def test_a_drive_is_judged_by_its_last_scans(kitti_root: Path, capsys: pytest.Ca
     *_, alone, three = capsys.readouterr().out.splitlines()
     assert alone.startswith("| 0048 | vlp-16 | 1 | ")
     assert three.startswith("| 0048 | vlp-16 | 3 | ")
-    assert all(0.0 <= float(value) <= 100.0 or value == "nan" for value in three.split(" | ")[3].split(" / "))
+    for column in (3, 5):
+        assert all(
+            0.0 <= float(each) <= 100.0 or each == "nan" for each in three.strip(" |").split(" | ")[column].split(" / ")
+        )
     assert three.split(" | ")[3] != alone.split(" | ")[3]
