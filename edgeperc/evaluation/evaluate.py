@@ -25,7 +25,7 @@ from ..system.pool import MOST_FIRST, taken
 from ..system.ray_cluster import ENGINES
 from ..types.mounting import Mounting
 from ..zoo import DEFAULT
-from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving, check_unit
+from .judge import BY_DEFAULT, NETWORK_ALONE, Judge, Perceiving, check_scans
 from .mistakes import Mistakes
 from .tables import Record, figures
 from .truth import Truth, check_different, seeds_of
@@ -102,7 +102,8 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     check_different(datasets)
-    for objects in map(KittiObjects, filter(_is_kitti, map(Path, datasets))):
+    of_kitti = [*map(KittiObjects, filter(_is_kitti, map(Path, datasets)))]
+    for objects in of_kitti:
         if not objects.has_table:
             _tell_no_drives(objects.root, "none is held back. docs/concepts/measure.md shows how to write it")
         objects.tell_left_out()
@@ -116,7 +117,9 @@ def evaluate(
             _tell_no_drives(folder.root, f"scans of one drive may be in two splits; {advice}")
     perceive, scans = job.scans(folders)
     for folder in folders.values():
-        check_unit(folder, folder.layout.sensor, _names(folder, split, fold))
+        check_scans(folder, folder.layout.sensor, _names(folder, split, fold))
+    for objects in of_kitti:
+        check_scans(objects, None, _names(objects, split, fold))
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
     evaluated: Iterator[_Figures] = (evaluate() for _, _, evaluate in scans)
@@ -220,7 +223,7 @@ def _side_by_side(
 
 
 def _is_kitti(root: Path) -> bool:
-    return (root / "training" / "label_2").is_dir()
+    return (root / "training" / "label_2").is_dir() and not (root / "scans.json").is_file()
 
 
 def _folder(dataset: str | Path) -> ScanFolder | None:

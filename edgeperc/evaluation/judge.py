@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..agreement.rules import RULES
-from ..datasets.kitti import Frame, RoadFrame, scan_hash
+from ..datasets.kitti import Frame, KittiObjects, RoadFrame, scan_hash
 from ..datasets.layout import COARSE, IGNORED, box_label, class_number
 from ..datasets.scan_folder import ScanFolder, ScanFrame
 from ..errors import ModelError, SplitError
@@ -45,7 +46,9 @@ from .tables import ALL_ROUND, BANDS, SITTING, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
-_DRIVES_CHECKED = 10  # by `check_unit`
+_DRIVES_CHECKED = 10  # by `check_scans`
+_NEAR_M = 20.0
+_MOST_EMPTY = 0.25  # of near boxes; 0 of the labels of six sets, 45 to 75 % of those of their next drive
 
 
 @dataclass(frozen=True)
@@ -385,13 +388,29 @@ def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Byt
     return numbers[labels]
 
 
-def check_unit(folder: ScanFolder, sensor: SensorProfile, names: Sequence[str]) -> None:
-    """Warn if the remission of a drive's first scan is in another unit than the sensor's: figures would be worse. Of a
-    few drives, as these scans are read again.
+def check_scans(scans: ScanFolder | KittiObjects, sensor: SensorProfile | None, names: Sequence[str]) -> None:
+    """Warn if the first scans of drives have remission in another unit than the sensor's, or labeled boxes in which
+    nothing stands, as those of another scan: figures would be worse. Of a few drives, as these scans are read again.
     """
-    first = [*{folder.drives[name]: name for name in reversed(names)}.values()]
+    first = [*{scans.drives[name]: name for name in reversed(names)}.values()]
     some = first[:: math.ceil(len(first) / _DRIVES_CHECKED)] if first else []
-    tell_beyond(folder.root, sensor, ((name, folder.frame(name).points) for name in some))
+    frames = [scans.frame(name) for name in some]
+    if sensor is not None:
+        tell_beyond(scans.root, sensor, ((frame.name, frame.points) for frame in frames))
+    n, empty = 0, list[str]()
+    for frame in frames:
+        for box in frame.boxes or ():
+            (x, y, z), height = box.center, box.size[2]
+            if box.label != IGNORED and math.hypot(x, y) < _NEAR_M:
+                n += 1
+                if not inside(box, frame.points[frame.points[:, 2] > z - 0.25 * height]).any():
+                    empty.append(f"the {box.label} at x {x:.1f}, y {y:.1f} of {frame.name}")
+    if len(empty) > max(2.0, _MOST_EMPTY * n):
+        warnings.warn(
+            f"{scans.root}: nothing stands in {len(empty)} of {n} labeled boxes within {_NEAR_M:g} m, such as "
+            f"{empty[0]}. Are these the labels of these scans, in their frame (m, x ahead, y left, z up)?",
+            stacklevel=3,
+        )
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:

@@ -29,7 +29,7 @@ from ..types.perception import Box
 from ..types.points import Labels, Points
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
-from .judge import Judge, Perceiving, check_unit, check_unseen, renamed, training_scans_of
+from .judge import Judge, Perceiving, check_scans, check_unseen, renamed, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
 from .truth import seeds_of
@@ -83,7 +83,7 @@ def compare(
     sets = {name: _dataset(name) for name in datasets}
     for sensor, _, _, folder in sets.values():
         if folder is not None:
-            check_unit(folder, sensor, names_of(folder, "test"))
+            check_scans(folder, sensor, names_of(folder, "test"))
     sizes = {name: (len(ADAPTATIONS) + (folder is not None)) * n for name, (_, n, _, folder) in sets.items()}
     total, done, result = sum(sizes.values()), 0, dict[str, Any]()
 

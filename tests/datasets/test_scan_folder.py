@@ -403,12 +403,18 @@ def test_a_training_tells_of_remissions_and_of_scans_twice(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("measure", [partial(evaluate, models=["pointseg"]), compare])
-def test_an_evaluation_tells_of_remissions_in_another_unit(tmp_path: Path, measure: Callable[..., Any]) -> None:
+def test_an_evaluation_tells_of_another_unit_and_of_labels_of_another_scan(
+    tmp_path: Path, measure: Callable[..., Any]
+) -> None:
     root, _ = street(tmp_path, drives="scan", splits={"test": ["3"]}, sensor="hdl-64e")
     description = json.loads((root / "scans.json").read_text())
     description["sensor"]["remission_range"] = [0, 100]
     (root / "scans.json").write_text(json.dumps(description))
-    with pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"):
+    (root / "label/3.txt").write_text("".join(f"car {x} 0 0.4 4 2 1.6 0\n" for x in (5, 9, 13, 17)))
+    with (
+        pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"),
+        pytest.warns(UserWarning, match=r"nothing stands in 4 of 4 labeled boxes within 20 m, such as the car at x 5"),
+    ):
         measure([str(root)])
 
 
