@@ -22,6 +22,7 @@ from ..system.names import nearest
 from ..system.printable import printable
 from .output import print_error, show_warning
 
+_FOLDER_GONE = "the current folder was removed; change to another one"
 # Modules with functions that native code calls.
 _DELICATE = ("llvmlite.", "numba.core.serialize", "importlib._bootstrap", "edgeperc.sinks.run_file", "logging")
 
@@ -86,7 +87,8 @@ def run_program(program: str, command: Callable[[], int | None], message: Callab
                     raise
                 if isinstance(exc, BrokenPipeError) and _unread():
                     return 141
-                print_error(message(exc), program)
+                is_gone = isinstance(exc, FileNotFoundError) and exc.filename is None  # only `os.getcwd` says so
+                print_error(_FOLDER_GONE if is_gone else message(exc), program)
                 return 2
         if raised:
             print_error("interrupted" if raised[0] == signal.SIGINT else "terminated", program)

@@ -198,6 +198,15 @@ def test_a_host_keeps_its_own_handler() -> None:
     assert caught == [signal.SIGTERM]
 
 
+@posix
+def test_a_folder_that_is_gone_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    (folder := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    assert run_program("program", lambda: len(Path().resolve().parts)) == 2
+    assert capsys.readouterr().err == "program: the current folder was removed; change to another one\n"
+
+
 def test_a_program_runs_in_any_thread() -> None:
     codes: list[int] = []
     thread = threading.Thread(target=lambda: codes.append(run_program("program", lambda: 3)))
