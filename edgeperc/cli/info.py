@@ -365,7 +365,7 @@ def _scan_rows(
         ("sensor", f"{sensor.name}: {because}"),
     ]
     if damage:
-        rows.append(("damage", f"after {len(scans)} scans: {damage}"))
+        rows.append(("damage", f"after {many(len(scans), 'scan')}: {damage}"))
     unit = check_dropped(scans[0], dropped, sensor)
     rows += [("unit", sentence) for sentence in unit]
     extent_rows, extents = _extent_rows(cleaned[0])

@@ -189,7 +189,7 @@ def _replies(
         code = process.wait(1.0)
     except subprocess.TimeoutExpired:
         code = 0
-    after = f"after {n_scans} scans " if n_scans else ""
+    after = f"after {n_scans} scan{'s' * (n_scans != 1)} " if n_scans else ""
     if watch.expired:
         raise PointsError(f"{path}: {after}decoding a scan took longer than {SCAN_LIMIT_S:g} s; the capture is damaged")
     if not ready:

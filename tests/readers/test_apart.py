@@ -60,7 +60,7 @@ def test_a_process_that_is_killed(ouster: Path, started: list[subprocess.Popen[b
     _, first = next(scans)
     assert len(first) == 64 * 256
     os.kill(started[0].pid, signal.SIGKILL)  # it waits: a scan is larger than the pipe
-    with pytest.raises(PointsError, match=r"sphere\.pcap: after 1 scans .* failed \(SIGKILL\)"):
+    with pytest.raises(PointsError, match=r"sphere\.pcap: after 1 scan .* failed \(SIGKILL\)"):
         next(scans)
     assert started[0].returncode == -signal.SIGKILL
 
@@ -567,7 +567,7 @@ def test_decoding_that_takes_more_memory_than_the_limit(tmp_path: Path, monkeypa
     monkeypatch.setattr(apart, "START", "import sys; sys.path[:] = sys.argv[1:]" + ALLOCATES)
     scans, error = read_until_error(write_pcap(tmp_path / "any.pcap", []))
     assert len(scans) == 1
-    assert "after 1 scans decoding the capture takes more than 2,147,483,648 bytes of memory" in error
+    assert "after 1 scan decoding the capture takes more than 2,147,483,648 bytes of memory" in error
 
 
 def test_a_scan_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -775,6 +775,7 @@ def test_a_page_of_one_scan_has_no_play_bar(browser: Any, tmp_path: Path) -> Non
     page = browser.new_page()
     page.goto((tmp_path / "drive.html").as_uri())
     assert not page.is_visible("#play")
+    assert "1 scan (all)" in page.content()
     page.close()
 
 
