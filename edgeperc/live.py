@@ -20,6 +20,7 @@ from .readers.identify import contradicts
 from .readers.ports import is_port
 from .readers.times import TimedScan, accumulate
 from .system.clock import LATEST_S, Clock, as_seconds
+from .system.fields import SCANS
 from .types.perception import Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile
@@ -112,7 +113,7 @@ def stream(
     PointsError
         The source is neither iterable nor a path, or the path does not exist.
     OptionError
-        The rate is not above 0, or 0 < late_after_s <= stale_after_s does not hold.
+        Perceiver or tracker cannot be called, the rate is not above 0, or not 0 < late_after_s <= stale_after_s.
 
     Warns
     -----
@@ -127,6 +128,9 @@ def stream(
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
     check_rate(rate_hz)
+    if not (callable(perceiver) and (tracker is None or callable(tracker))):
+        told = f"perceiver is {perceiver!r:.200} and tracker {tracker!r:.200}"
+        raise OptionError(f"{told}; expected a Perceiver, and a Tracker or None")
     if not all(isinstance(age_s, Real | None) for age_s in (late_after_s, stale_after_s)):
         raise OptionError(f"late_after_s is {late_after_s!r} and stale_after_s {stale_after_s!r}; expected seconds")
     late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
@@ -139,10 +143,7 @@ def stream(
         read = read_scans(Path(source), topic=topic, accumulate_s=accumulate_s)
         scans: Iterator[Any] = read if is_port(Path(source)) else paced(read, rate_hz, inbox.stopped)
     else:
-        try:
-            scans = iter(source)
-        except TypeError as exc:
-            raise PointsError(f"got a source of type {type(source).__name__}; expected scans or a path") from exc
+        scans = SCANS.iterator("source", source, "scans or a path")
         if accumulate_s is not None:
             timed = (TimedScan(stamp_s, as_points(points), None) for points, stamp_s in map(_stamped, scans))
             scans = ((stamp_s, points) for stamp_s, points, _ in accumulate(timed, accumulate_s))

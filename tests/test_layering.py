@@ -25,8 +25,8 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors
-        system.__init__ system.atomic system.clock system.extras system.fields system.interpreter
-        system.lanes system.names
+        system.__init__ system.clock system.extras system.fields system.interpreter
+        system.atomic system.lanes system.names
         system.printable
         system.machine system.remote
         system.pool

@@ -8,7 +8,9 @@ import inspect
 import pickle
 import pkgutil
 import re
+from typing import Any
 
+import numpy as np
 import pytest
 
 import edgeperc
@@ -17,7 +19,9 @@ import edgeperc.zoo
 from checkout import REPOSITORY
 from edgeperc.errors import ModelFileError
 from edgeperc.inference import listing, providers
-from edgeperc.types.sensor import SENSORS
+from edgeperc.system.atomic import write_atomic
+from edgeperc.system.names import check_picture
+from edgeperc.types.sensor import SENSORS, get_sensor
 
 MODULES = sorted(
     found.name for found in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") if not found.name.endswith("__main__")
@@ -78,6 +82,31 @@ def test_errors_have_one_root_and_come_out_of_other_processes() -> None:
         error = getattr(edgeperc, name)("onnxruntime", "cpu", "Running a model")
         assert isinstance(error, edgeperc.EdgepercError)
         assert repr(pickle.loads(pickle.dumps(error))) == repr(error)
+
+
+WRONG = {
+    "an image": (edgeperc.ImageError, edgeperc.read_image),
+    "a calibration": (edgeperc.CalibrationError, lambda given: edgeperc.Calibration.from_kitti(given, 9, 9)),
+    "a mounting": (edgeperc.SensorError, edgeperc.Mounting.from_file),
+    "poses": (edgeperc.TrackingError, edgeperc.Trajectory.from_tum),
+    "a card": (ModelFileError, edgeperc.ModelCard.read),
+    "a sensor": (edgeperc.SensorError, get_sensor),
+    "a file": (edgeperc.OptionError, lambda given: write_atomic(given, b"")),
+    "a picture": (edgeperc.OptionError, lambda given: check_picture(given, ".png")),
+    "sensors": (edgeperc.PointsError, lambda given: edgeperc.merge(given, [])),
+    "their poses": (edgeperc.SensorError, lambda given: edgeperc.merge([np.zeros((1, 4))], given)),
+    "scans": (edgeperc.PointsError, lambda given: next(edgeperc.accumulate(given, 0.1))),
+    "a perceiver": (edgeperc.OptionError, lambda given: edgeperc.stream([], given)),
+    "a tracker": (edgeperc.OptionError, lambda given: edgeperc.stream([], print, given)),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("given", [7, 1.5, np.array(0.5), np.zeros(3)], ids=["int", "float", "one", "array"])
+def test_what_is_of_another_type_is_a_typed_error(what: str, given: Any) -> None:
+    error, take = WRONG[what]
+    with pytest.raises(error, match=r"expected|no sensor"):
+        take(given)
 
 
 def test_the_version_is_the_changelogs_newest() -> None:

@@ -6,7 +6,6 @@ import math
 import os
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -155,11 +154,12 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[Floats, Floats
 
 
 def _kitti_matrices(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
-    folder = Path(path) if Path(path).is_dir() else Path(path).parent
-    is_raw = Path(path).is_dir() or Path(path).name in _RAW_FILES
+    path = _FIELDS.path("the calibration", path)
+    folder = path if path.is_dir() else path.parent
+    is_raw = path.is_dir() or path.name in _RAW_FILES
     values: dict[str, Floats] = {}
     try:
-        for file in [folder / name for name in _RAW_FILES] if is_raw else [Path(path)]:
+        for file in [folder / name for name in _RAW_FILES] if is_raw else [path]:
             for line in file.read_text("utf-8-sig").splitlines():
                 key, _, numbers = line.replace(":", " ", 1).partition(" ")
                 if numbers.strip() and key != "calib_time":

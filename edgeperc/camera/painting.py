@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CalibrationError, ImageError, OptionError
 from ..ground.planes import fit_ground, heights_above
 from ..preprocess.returns import returns
+from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
@@ -179,7 +180,7 @@ def camera_road(
     An error of the ground's height or of the camera's pitch moves the road away from the camera or towards it: at 20 m
     and 1.65 m above the road, 0.1 m of height by 1.2 m, 0.1 degree of pitch by 0.4 m.
     """
-    geometry = TopViewGeometry() if view is None else view
+    geometry = TopViewGeometry() if view is None else OPTIONS.read(TopViewGeometry, view, "view")
     road = _road_of(image, calibration)
     x, y = (each.ravel() for each in np.broadcast_arrays(*geometry.cell_centers()))
     _, buffer, cells = _hidden_by(image, points, calibration, sensor, mounting, np.column_stack([x, y]))

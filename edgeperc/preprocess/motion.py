@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
 from ..system.clock import as_seconds
-from ..system.fields import OPTIONS
+from ..system.fields import OPTIONS, SCANS, Fields
 from ..system.kernels import njit
 from ..types.frame import fill_moved, pose_between, poses_of, quaternion
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
@@ -24,6 +23,7 @@ from ..types.rigid import numbers_of, rigid, times_of
 from ..types.sensor import MAX_ACCUMULATE_S
 from .returns import blank_too_near
 
+_POSES, _WAY = Fields("the poses", SensorError), Fields("the poses", TrackingError)
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
@@ -188,8 +188,9 @@ class Trajectory:
             raise OptionError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
         if maps_from not in (None, "sensor", "world"):
             raise OptionError(f"maps_from is {maps_from!r}; expected 'sensor' or 'world'")
+        path = _WAY.path("the poses", path)
         try:
-            with Path(path).open("rb") as file:
+            with path.open("rb") as file:
                 content = file.read(MAX_BYTES + 1).removeprefix(b"\xef\xbb\xbf")
             rows = _rows(content)
         except (OSError, ValueError) as exc:
@@ -384,7 +385,8 @@ def merge(
     OptionError
         ``min_range_m`` is not one number of meters from 0, or one for each scan.
     """
-    rows, poses = [as_points(scan) for scan in scans], list(T_vehicle_sensor)
+    rows = [as_points(scan) for scan in SCANS.iterator("scans", scans, "a list of scans")]
+    poses = [*_POSES.iterator("T_vehicle_sensor", T_vehicle_sensor, "a list of 4 x 4 matrices")]
     if not rows:
         raise PointsError("got no scan; expected at least one")
     if len(poses) != len(rows):

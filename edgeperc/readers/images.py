@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,11 @@ import numpy as np
 from ..camera.image import check_size
 from ..errors import ImageError
 from ..system.extras import require
+from ..system.fields import Fields
 from ..types.points import Bytes
 from .unknown import missing
 
+_FIELDS = Fields("the image", ImageError)
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".webp")
 # Only these decoders: others of Pillow start programs (EPS), print what is damaged (TIFF) or are of no camera.
 FORMATS = ("BMP", "JPEG", "PNG", "PPM", "WEBP")
@@ -50,7 +51,7 @@ def read_image(path: str | os.PathLike[str]) -> Bytes:
     """
     pillow = require("PIL.Image", "camera", "Reading an image", package="pillow")
     turned = require("PIL.ImageOps", "camera", "Reading an image", package="pillow").exif_transpose
-    path = Path(path)
+    path = _FIELDS.path("the image", path)
     try:
         if not path.is_file():
             raise ImageError(missing(path, "file", "an image as .jpg, .png, .webp, .bmp or .ppm"))

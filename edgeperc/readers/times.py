@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError, StampError
 from ..system.clock import as_seconds
-from ..system.fields import OPTIONS
+from ..system.fields import OPTIONS, SCANS
 from ..types.points import Floats, Mask, Points, as_points
 from ..types.rigid import times_of
 from ..types.sensor import MAX_ACCUMULATE_S, MIN_ACCUMULATE_S
@@ -249,7 +249,7 @@ def accumulate(
     begin_s, end_s, middle_s = 0.0, 0.0, -np.inf
     last: float | None = None
     is_waiting = False
-    for scan in scans:
+    for scan in SCANS.iterator("scans", scans, "an iterable of edgeperc.TimedScan"):
         if not isinstance(scan, tuple) or len(scan) != 3:
             raise PointsError(f"got a {type(scan).__name__}; expected each scan as edgeperc.TimedScan")
         stamp_s, points, times_s = scan

@@ -156,7 +156,7 @@ class OccupancyGrid:
         """
         values = self.values(off_road)[::-1].astype(np.int64)  # the first row of an image is its top
         pixels = np.where(values < 0, 205, 254 - values * 254 // 100).astype(np.uint8)
-        out = Path(folder)
+        out = OPTIONS.path("folder", folder)
         out.mkdir(parents=True, exist_ok=True)
         write_atomic(out / "map.pgm", f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
         # 205 stands for an occupancy of 0.1961: above free_thresh, so unknown.

@@ -18,6 +18,7 @@ from ..camera.calibration import level_heading, read_kitti_calibration, warn_off
 from ..errors import CalibrationError, EdgepercError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
+from ..system.fields import OPTIONS
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box, Perception
@@ -101,7 +102,7 @@ class PrelabelSink:
             raise OptionError(f"no labels are known for {kind!r}; expected one of {', '.join(KINDS)}")
         if calib is not None and kind != "kitti":
             raise OptionError(f"labels for {kind} need no calibration; leave it out, or choose kitti")
-        self._folder, self._kind = Path(folder), kind
+        self._folder, self._kind = OPTIONS.path("folder", folder), kind
         self._writer: Callable[[str, _Item, Sequence[Named]], None] = getattr(self, f"_{kind}")
         self._calib = None if calib is None else Path(calib)
         self._files = ScanFiles()
@@ -167,7 +168,7 @@ class PrelabelSink:
             if drive and whole:
                 self._write_drive(drive)
             elif drive:
-                text = f"{len(drive)} scans of a drive that was stopped have no labels, which come when it is over"
+                text = f"a drive stopped after {len(drive)} scan{'s' * (len(drive) != 1)}: labels come when it is over"
                 warnings.warn(f"{self._folder}: {text}", RuntimeWarning, stacklevel=2)
             if self._errors:
                 first, n_more = self._errors[0], len(self._errors) - 1

@@ -7,7 +7,6 @@ import inspect
 import os
 import sqlite3
 from contextlib import closing, suppress
-from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import OptionError
@@ -15,6 +14,7 @@ from ..records import PerceivedScan
 from ..ros2.messages import OUTPUTS, RosMessages, nanoseconds
 from ..system.atomic import beside
 from ..system.extras import require
+from ..system.fields import OPTIONS
 from .run_file import settle
 
 __all__ = ["TOPICS", "BagSink"]
@@ -53,7 +53,7 @@ class BagSink:
         storage: Literal["sqlite3", "mcap"] = "sqlite3",
         frame_id: str = "lidar",
     ) -> None:
-        self._folder = Path(folder)
+        self._folder = OPTIONS.path("folder", folder)
         rosbag2 = require("rosbags.rosbag2", "ros", "Writing a ROS 2 bag", package="rosbags")
         self._messages = RosMessages(frame_id)
         if self._folder.exists() or self._folder.is_symlink():

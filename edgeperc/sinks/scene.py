@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import PointsError
 from ..records import PerceivedScan
 from ..system.clock import nanoseconds_of
+from ..system.fields import OPTIONS
 from ..tracking.tracks import Tracks
 from ..types.perception import scan_of
 from ..types.points import Bytes, Floats, Floats32
@@ -29,7 +30,7 @@ _TRAIL = 100  # scans
 
 def checked_target(path: str | os.PathLike[str]) -> Path:
     """A file that a run will write; `FileNotFoundError` before the first scan if its folder is missing."""
-    target = Path(path)
+    target = OPTIONS.path("path", path)
     if not target.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the file's folder is missing", str(target.parent))
     return target

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
+from ..system.fields import OPTIONS
 from ..system.remote import location
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Floats32, Mask, as_points
@@ -55,7 +56,7 @@ class StaticSink:
     def __init__(self, folder: str | Path, *, without: Literal["moving", "movable"] = "moving") -> None:
         if without not in ("moving", "movable"):
             raise OptionError(f"without is {without!r}; expected 'moving' or 'movable'")
-        self._folder, self._without = Path(folder), without
+        self._folder, self._without = OPTIONS.path("folder", folder), without
         self._folder.mkdir(parents=True, exist_ok=True)
         self._files = ScanFiles()
         self.n_points = self.n_removed = 0

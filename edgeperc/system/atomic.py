@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from .fields import OPTIONS
+
 
 @contextmanager
 def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) -> Iterator[IO[Any]]:
@@ -18,7 +20,7 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     directly. What was written is on the disk before it has its name; an `OSError` has the target's. ``permissions`` of
     a new file are reduced by the umask.
     """
-    path = Path(os.path.realpath(path))
+    path = Path(os.path.realpath(OPTIONS.path("path", path)))
     if path.exists() and not path.is_file():
         with path.open(mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file

@@ -5,14 +5,16 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
 import reprlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from numbers import Integral
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ..errors import OptionError
+from ..errors import OptionError, PointsError
 
 T = TypeVar("T")
 MAX_NUMBER = 1e300
@@ -50,13 +52,22 @@ class Fields:
 
     def each(self, name: str, values: Any, kind: type[T]) -> tuple[T, ...]:
         """Objects of a type."""
-        if not hasattr(values, "__iter__"):
-            self.refuse(name, values, f"{kind.__name__} objects")
-        given = tuple(values)
+        given = tuple(self.iterator(name, values, f"{kind.__name__} objects"))
         for index, value in enumerate(given):
             if not isinstance(value, kind):
                 self.refuse(f"{name}[{index}]", value, f"a {kind.__name__}")
         return given
+
+    def iterator(self, name: str, values: Any, expected: str) -> Iterator[Any]:
+        """What can be taken one after another."""
+        try:
+            return iter(values)
+        except TypeError:
+            self.refuse(name, values, expected)
+
+    def path(self, name: str, value: Any) -> Path:
+        """A path."""
+        return Path(value) if isinstance(value, str | os.PathLike) else self.refuse(name, value, "a path")
 
     def number(self, name: str, value: Any, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:
         """A finite number from ``low`` to ``high``."""
@@ -147,6 +158,7 @@ class Fields:
 
 
 OPTIONS = Fields("the options", OptionError)  # of what callers pass
+SCANS = Fields("the scans", PointsError)
 
 
 @functools.cache

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import PurePath, PureWindowsPath
 
 from ..errors import OptionError
+from .fields import OPTIONS
 
 MAX_NAME = 200
 _PICTURES = {
@@ -56,7 +57,7 @@ def check_name(field: str, name: str, error: type[Exception]) -> None:
         )
 
 
-def check_picture(path: PurePath | str, suffix: str) -> None:
-    """Refuse a path that is named as another kind of picture or film. Raises OptionError."""
-    if PurePath(path).suffix.lower() in _PICTURES - {suffix}:
+def check_picture(path: PurePath | str | None, suffix: str) -> None:
+    """Refuse what is no path, or is named as another kind of picture or film. Raises OptionError."""
+    if path is not None and OPTIONS.path("path", path).suffix.lower() in _PICTURES - {suffix}:
         raise OptionError(f"{path} would hold a picture in {suffix}; expected a name that ends so")

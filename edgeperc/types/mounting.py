@@ -6,7 +6,6 @@ import json
 import math
 import os
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -113,9 +112,9 @@ class Mounting:
         SensorError
             The file cannot be read, or holds something else.
         """
-        name = os.fspath(path)
+        name = FIELDS.path("the extrinsic calibration", path)
         try:
-            with Path(path).open("rb") as file:
+            with name.open("rb") as file:
                 text = file.read(100_001).decode("utf-8-sig")
         except (OSError, UnicodeDecodeError) as exc:
             raise SensorError(f"{name}: the extrinsic calibration cannot be read ({exc})") from exc

@@ -15,7 +15,9 @@ from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
 from ..errors import CardError, ModelFileError
+from ..system.fields import Fields
 
+_FIELDS = Fields("the model", ModelFileError)
 MAX_BYTES = 2 * 10**9  # protobuf itself stops at 2 GiB
 MAX_ENTRY_BYTES = 16 * 10**6
 MAX_TOP_FIELDS = 10_000  # of the file itself, which has about twenty; a file of empty fields would take minutes to read
@@ -64,6 +66,7 @@ DEFERRED = frozenset(
 
 def open_model(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a model's file, which has to be a regular file of at most 2 GB."""
+    path = _FIELDS.path("the model", path)
     try:
         # A pipe would be waited for if it were not opened without blocking.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -557,7 +557,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     except (KeyError, TypeError):
         raise SensorError(
             "sensor 'auto' is found by a Perceiver, and not here: pass Perceiver.sensor, or what 'edgeperc info' names"
-            if sensor == AUTO_SENSOR
+            if str(sensor) == AUTO_SENSOR
             else f"no sensor {sensor!r} is built in{nearest(str(sensor), (*SENSORS, *PUBLIC_SENSORS))}; "
             f"known are {', '.join(SENSORS)}, "
             f"and of public sets {', '.join(PUBLIC_SENSORS)}. "

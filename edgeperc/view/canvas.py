@@ -38,7 +38,7 @@ def new_figure(width: int, height: int) -> Any:
 
 def as_png(figure: Any, path: str | Path | None) -> bytes:
     """Encode the figure as a PNG, and write it to ``path`` unless that is None."""
-    check_picture(path or "", ".png")
+    check_picture(path, ".png")
     from PIL import Image  # a dependency of matplotlib
 
     figure.canvas.draw()

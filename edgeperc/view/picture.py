@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
+from ..system.fields import OPTIONS
 from ..types.choices import STATIC
 from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
@@ -81,7 +82,7 @@ def draw(perception: Perception, points: ArrayLike, path: str | Path | None = No
     PointsError
         ``points`` is not the scan that was perceived.
     OptionError
-        ``path`` is named as a picture of another kind.
+        ``path`` is none, or named as a picture of another kind; or ``title`` is no text.
     OSError
         The file cannot be written.
     """
@@ -180,7 +181,7 @@ def write_frame(
     tops: tuple[float, float],
 ) -> None:
     """Write what stands around panels: title of at most so many pixels and what is shown, below legend and timing."""
-    text, room = title
+    text, room = OPTIONS.read(str, title[0], "title"), title[1]
     style = {"fontsize": 23.0, "fontweight": "bold"}
     canvas.write_at(figure, _MARGIN, 46, canvas.shorten(figure, text, room, **style), **style)
     canvas.write_at(figure, _WIDTH - _MARGIN, 46, about, fontsize=18.0, ha="right", color=FAINT)

@@ -129,7 +129,7 @@ def draw_tracks(
         The file cannot be written.
     """
     require("PIL", "view", "Drawing an animation", package="pillow")
-    check_picture(path or "", ".gif")
+    check_picture(path, ".gif")
     if len(scans) < 2:
         raise TrackingError(
             f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "

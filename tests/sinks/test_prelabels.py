@@ -281,7 +281,7 @@ def test_labels_of_a_drive_come_when_it_is_over(tmp_path: Path) -> None:
     assert [len(of_scan) for of_scan in labels] == [1] * 6
     assert len({of_scan[0][1][3] for of_scan in labels}) == 1  # one size
     sink.write(replace(perceived("000010.bin", ahead, tracks), health="OK"))
-    warned = pytest.warns(RuntimeWarning, match="2 scans of a drive that was stopped have no labels")
+    warned = pytest.warns(RuntimeWarning, match="a drive stopped after 2 scans: labels come")
     with warned, pytest.raises(OptionError, match=r"000002\.json exists with other content"):
         sink.close(whole=False)
     assert [place.exists() for place in places[8:]] == [False, False, True]
