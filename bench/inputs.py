@@ -16,6 +16,7 @@ from edgeperc.preprocess.sensor_estimate import MOST_SCANS, has_enough_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.system.printable import many
 from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from edgeperc.types.points import Floats32, Points
 from edgeperc.types.sensor import SENSORS, get_sensor
@@ -63,7 +64,7 @@ def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> tuple[Input,
     for file, scan in zip(files, scans, strict=True):
         if sensor == AUTO_SENSOR and has_enough_points(scan):
             by_folder.setdefault(file.parent, []).append(scan)
-    source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
+    source = f"{many(len(files), 'scan')}: {', '.join(file.name for file in files[:8])}"
     name = sensor = DEFAULT_SENSOR if sensor == AUTO_SENSOR and not by_folder else sensor  # as `edgeperc run` takes it
     if sensor == AUTO_SENSOR:
         seen = {where: sensor_in(some[:MOST_SCANS]) for where, some in by_folder.items()}

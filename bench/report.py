@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from edgeperc.system.printable import many
+
 from .document import latency, pooled, scenario_names, setting_label, stage_medians
 from .render import QUANTILES, Section, number, share
 from .samples import percentile, supported
@@ -66,7 +68,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             rows.append([name, f"{t['n']:,}", *(number(t[q]) for q in QUANTILES), share(t["noise"]), *costs])
         n = len(setting["repeats"])
         sentences = [
-            f"from scan to result in ms; {n} repeat{'s' * (n != 1)}, each in a fresh process; a dash: too few samples "
+            f"from scan to result in ms; {many(n, 'repeat')}, each in a fresh process; a dash: too few samples "
             "for this percentile; noise: spread of the repeats' medians"
         ]
         used = {name: t["energy_j_per_scan"] for name, t in figures.items() if t["energy_j_per_scan"]}

@@ -19,9 +19,10 @@ from typing import Any, Literal
 
 from .. import __version__
 from ..errors import EdgepercError, MissingExtraError, SettingsError
+from ..system.printable import many
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_command, options
-from .output import many, one_line, print_columns, print_line
+from .output import one_line, print_columns, print_line
 
 # Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
 _FOR_DEVELOPERS = ("docs", "test")

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from ..system.atomic import write_atomic
+from ..system.printable import many
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, check_inputs, options
-from .output import in_options, many, print_error, print_line, print_rows
+from .output import in_options, print_error, print_line, print_rows
 from .scans import Sensors, check_profile_place, check_scans, check_sensor, reading_options
 
 if TYPE_CHECKING:

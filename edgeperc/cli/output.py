@@ -201,11 +201,6 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def many(n: int, noun: str) -> str:
-    """A count and its noun, singular or plural."""
-    return f"{n:,} {noun}{'s' * (n != 1)}"
-
-
 def table_lines(
     title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
 ) -> list[str]:

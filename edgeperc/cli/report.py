@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
+from ..system.printable import many
 from ..system.remote import Remote
-from .output import in_options, many, one_line, print_error, print_result
+from .output import in_options, one_line, print_error, print_result
 
 if TYPE_CHECKING:
     from ..live import Answer

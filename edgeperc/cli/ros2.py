@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..errors import OptionError, SensorError
+from ..system.printable import many
 from ..types.choices import AUTO_SENSOR
 from .arguments import (
     Commands,
@@ -19,7 +20,7 @@ from .arguments import (
     positive,
     positive_number,
 )
-from .output import many, print_error, print_line
+from .output import print_error, print_line
 from .run import make_perceiver
 from .scans import check_sensor, with_mounting
 

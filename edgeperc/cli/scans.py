@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import EdgepercError, ImageError, SensorError
 from ..system.names import by_number
+from ..system.printable import many
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from .arguments import check_inputs, file_options
-from .output import many
 
 if TYPE_CHECKING:
     from ..preprocess.sensor_estimate import SensorEstimate

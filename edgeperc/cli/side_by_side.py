@@ -25,11 +25,12 @@ from .. import __version__
 from ..errors import EdgepercError
 from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
+from ..system.printable import many
 from ..system.ray_cluster import ENGINES
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR
 from .arguments import options, positive
-from .output import many, one_line, print_line
+from .output import one_line, print_line
 from .report import Report
 from .scans import is_recording
 

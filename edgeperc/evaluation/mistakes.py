@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..system.printable import many
 from ..types.perception import Box
 from ..types.points import Bytes, Mask, Points
 from ..view.canvas import (
@@ -78,7 +79,7 @@ class Mistakes:
         n_wrong, n_shown = (int(np.count_nonzero(each)) for each in (self.wrong, self.wrong[self.shown]))
         if n_wrong:
             farther = f", {n_wrong - n_shown:,} of them farther" if n_shown < n_wrong else ""
-            parts.append(f"{n_wrong:,} point{'s' * (n_wrong != 1)} wrong{farther}")
+            parts.append(f"{many(n_wrong, 'point')} wrong{farther}")
         return "; ".join(parts) or "no mistake"
 
 
@@ -103,7 +104,7 @@ def draw_mistakes(
     height = round(width / _ASPECT)
     rows = -(-len(wrong) // columns)
     figure = new_figure(_WIDTH, _TOP + (rows * (height + _CAPTION + _GAP) if wrong else 90))
-    heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes"
+    heading = f"{many(len(wrong), 'scan')} with mistakes"
     if len(wrong) < len(scans):
         heading += f", {len(scans) - len(wrong)} without"
     style = {"fontsize": 21.0, "fontweight": "bold"}

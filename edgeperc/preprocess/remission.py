@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SensorError
+from ..system.printable import many
 from ..types.points import Floats, Floats32, Ints64, Points
 from ..types.sensor import RemissionFunction, SensorProfile
 from .condition import scale
@@ -167,7 +168,7 @@ class RemissionMatcher:
         if off <= limit * (1.0 if self.matched is None else _HYSTERESIS):
             return None
         low, high = self.sensor.remission_range
-        source = f"matched to {self.n_scans} scan{'s' * (self.n_scans > 1)}, quantiles by range and incidence"
+        source = f"matched to {many(self.n_scans, 'scan')}, quantiles by range and incidence"
         try:
             best = increasing(fit_functions(raw - low, wanted, full_scale=high - low, to=self._to, source=source))
         except SensorError:  # nearly all points have one remission

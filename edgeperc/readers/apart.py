@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.interpreter import interpreter, interpreter_flags
+from ..system.printable import many
 from ..types.points import Floats, Points
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
@@ -189,7 +190,7 @@ def _replies(
         code = process.wait(1.0)
     except subprocess.TimeoutExpired:
         code = 0
-    after = f"after {n_scans} scan{'s' * (n_scans != 1)} " if n_scans else ""
+    after = f"after {many(n_scans, 'scan')} " if n_scans else ""
     if watch.expired:
         raise PointsError(f"{path}: {after}decoding a scan took longer than {SCAN_LIMIT_S:g} s; the capture is damaged")
     if not ready:

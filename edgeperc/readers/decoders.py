@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import MissingExtraError, PointsError
 from ..system.clock import Stamp
 from ..system.extras import require
+from ..system.printable import many
 from ..types.points import is_remission_name, table_columns
 from .alternation import told_apart
 from .bags import open_bag
@@ -135,10 +136,10 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
     except PointsError as exc:
         raise PointsError(f"{path}: {exc}") from exc
     except MemoryError as exc:
-        after = f"after {n_scans} scan{'s' * (n_scans != 1)} " if n_scans else ""
+        after = f"after {many(n_scans, 'scan')} " if n_scans else ""
         raise PointsError(f"{path}: {after}decoding the capture takes more than {MAX_BYTES:,} bytes of memory") from exc
     except Exception as exc:  # of libraries, and of numpy, struct and sqlite on damaged files
-        after = f"after {n_scans} scan{'s' * (n_scans != 1)} " if n_scans else ""
+        after = f"after {many(n_scans, 'scan')} " if n_scans else ""
         reason = " ".join(str(exc).split()) or type(exc).__name__
         raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
     if not n_scans:
@@ -405,7 +406,7 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
                 continue
             if len(frames) > 1 and not frame:
                 raise PointsError(
-                    f"after {n_scans} scan{'s' * (n_scans != 1)}: the clouds of topic {chosen} are of several sensors, "
+                    f"after {many(n_scans, 'scan')}: the clouds of topic {chosen} are of several sensors, "
                     f"with the frames {', '.join(frames)}; choose one, e.g. topic '{chosen}@{next(iter(frames))}' "
                     "(--topic), or read each and put them together with edgeperc.merge"
                 )
@@ -465,4 +466,4 @@ def _messages(
         except PointsError as exc:
             damage = damage or exc
     if damage is not None:
-        raise PointsError(f"after {n} scan{'s' * (n != 1)} {damage}" if n else str(damage)) from damage
+        raise PointsError(f"after {many(n, 'scan')} {damage}" if n else str(damage)) from damage

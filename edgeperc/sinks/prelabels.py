@@ -19,6 +19,7 @@ from ..errors import CalibrationError, EdgepercError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
 from ..system.fields import OPTIONS
+from ..system.printable import many
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box, Perception
@@ -168,7 +169,7 @@ class PrelabelSink:
             if drive and whole:
                 self._write_drive(drive)
             elif drive:
-                text = f"a drive stopped after {len(drive)} scan{'s' * (len(drive) != 1)}: labels come when it is over"
+                text = f"a drive stopped after {many(len(drive), 'scan')}: labels come when it is over"
                 warnings.warn(f"{self._folder}: {text}", RuntimeWarning, stacklevel=2)
             if self._errors:
                 first, n_more = self._errors[0], len(self._errors) - 1

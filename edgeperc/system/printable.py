@@ -18,3 +18,8 @@ def printable(text: object) -> str:
     return "".join(
         c if c.isprintable() else f"\\u{ord(c):04x}" if ord(c) < 0x10000 else f"\\U{ord(c):08x}" for c in shown
     )
+
+
+def many(n: int, noun: str) -> str:
+    """A count and its noun, singular or plural."""
+    return f"{n:,} {noun}{'s' * (n != 1)}"

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from ..camera.image import as_image
 from ..errors import ImageError
 from ..ground.planes import fit_ground
-from ..system.printable import printable
+from ..system.printable import many, printable
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from ..types.perception import Box, ImageLabels, Perception, TopView
@@ -175,7 +175,7 @@ def class_facts(perception: Perception) -> dict[str, list[str]]:
         if name in labels:
             facts[name].append(f"{labels.count(name)} box{'es' * (labels.count(name) > 1)}")
         if counts.get(name):
-            facts[name].append(f"{counts[name]:,} point{'s' * (counts[name] != 1)}")
+            facts[name].append(many(counts[name], "point"))
     return facts
 
 

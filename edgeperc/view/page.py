@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..system.atomic import open_atomic
 from ..system.clock import step_between
-from ..system.printable import printable
+from ..system.printable import many, printable
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats32, Points
@@ -166,7 +166,7 @@ class DrivePage:
         """
         kept = f"every {self.every}. of {self._n:,}" if self.every > 1 else "all"
         thinned = f"thinned to {self.n_points:,} points" if self._most > self.n_points else "with all points"
-        facts = f"{len(self._scans):,} scan{'s' * (len(self._scans) != 1)} ({kept}), {thinned}"
+        facts = f"{many(len(self._scans), 'scan')} ({kept}), {thinned}"
         texts = (scan.to_json() for scan in self._scans)
         times_s = [round(scan.time_s, 3) for scan in self._scans]
         _fill_page(path, self._title or "A drive", facts, self._fitness.values(), self._classes, texts, times_s)

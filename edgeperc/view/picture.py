@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..road.ahead import FreeAhead, RoadAhead, road_ahead
 from ..system.fields import OPTIONS
+from ..system.printable import many
 from ..types.choices import STATIC
 from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
@@ -300,7 +301,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
 
 
 def _omitted(text: str, n_omitted: int) -> str:
-    return f"{text}; {n_omitted} label{'s' * (n_omitted != 1)} omitted" if n_omitted else text
+    return f"{text}; {many(n_omitted, 'label')} omitted" if n_omitted else text
 
 
 def _draw_range_image(figure: Any, place: Place, drawn: _Drawn, turn_deg: float) -> None:

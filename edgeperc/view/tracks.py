@@ -18,6 +18,7 @@ from ..system.atomic import write_atomic
 from ..system.clock import elapsed_s
 from ..system.extras import require
 from ..system.names import check_picture
+from ..system.printable import many
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception
@@ -132,7 +133,7 @@ def draw_tracks(
     check_picture(path, ".gif")
     if len(scans) < 2:
         raise TrackingError(
-            f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "
+            f"got {many(len(scans), 'scan')} for an animation; expected two or more of a drive. "
             "A single scan is drawn by edgeperc.draw, or run --png"
         )
     for given, what in ((under, "flattened scans"), (mountings, "mountings")):
@@ -190,7 +191,7 @@ def _pictures(
             trail = (np.array(trails[track.id])[:, :3] - t) @ R @ frame.R.T + frame.t
             _draw_track(pen, track, trail, frame.move_boxes([track.predicted(s) for s in _AHEAD_S]))
         _write_names(pen, drawn, frame, fonts[14])
-        facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
+        facts = f"{time_s:.1f} s · {many(len(tracks), 'track')}"
         _write_frame(pen, title, facts, labels, fonts, tail_s)
         yield picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from ...system.printable import many
 from ..arguments import Commands, add_command, add_figures_file, options
-from ..output import lines_last, make_places, many, progress, table_lines, write_figures
+from ..output import lines_last, make_places, progress, table_lines, write_figures
 
 # Places of the camera in the LiDAR's frame: as on KITTI's car, and behind a windscreen below a LiDAR on the roof.
 _PLACES = {"0.3 m": (0.27, 0.0, -0.08), "0.9 m": (0.5, 0.5, -0.6)}

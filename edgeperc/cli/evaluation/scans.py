@@ -9,6 +9,7 @@ from typing import Any
 
 from ...system.extras import require
 from ...system.names import check_picture
+from ...system.printable import many
 from ...types.choices import CAMERA, RULES
 from ..arguments import (
     Commands,
@@ -22,7 +23,7 @@ from ..arguments import (
     keywords,
     options,
 )
-from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
+from ..output import FEW, lines_last, make_places, progress, table_lines, write_figures
 from ..side_by_side import add_engine, has_workers
 from .box_tables import box_table_lines, interval_columns
 

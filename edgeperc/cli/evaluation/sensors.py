@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from ...system.printable import many
 from ..arguments import Commands, add_command, add_figures_file, add_provider, keywords, options, positive
-from ..output import FEW, lines_last, make_places, many, progress, table_lines, write_figures
+from ..output import FEW, lines_last, make_places, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from ...errors import PointsError
 from ...system.extras import require
 from ...system.names import check_picture
+from ...system.printable import many
 from ..arguments import Commands, add_command, add_figures_file, add_networks, add_sensor, options, positive_number
-from ..output import lines_last, make_places, many, progress, table_lines, without_nan, write_figures
+from ..output import lines_last, make_places, progress, table_lines, without_nan, write_figures
 from ..run import make_perceiver
 
 if TYPE_CHECKING:

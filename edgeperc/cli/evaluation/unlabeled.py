@@ -10,7 +10,8 @@ from ...evaluation.consistency import Consistency
 from ...records import PerceivedScan
 from ...sinks.run_file import warn_of
 from ...system.atomic import part_of, write_atomic
-from ..output import many, print_line, table_lines
+from ...system.printable import many
+from ..output import print_line, table_lines
 
 _COLUMNS = (
     *(("objects", "n_objects"), ("in scans", "n_scans"), ("detected", "detected"), ("class", "class")),
