@@ -82,11 +82,6 @@ def receptive_field(dilations: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
     return tuple(1 + 2 * sum(along) for along in zip(*dilations, strict=True))
 
 
-def test_receptive_fields_follow_from_the_dilations() -> None:
-    assert list(ssadnet.CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
-    assert [receptive_field(ssadnet.CONTEXT_DILATIONS[:k]) for k in range(1, 8)] == [field for _, field in TABLE_1]
-
-
 @pytest.mark.parametrize("k", range(1, 8))
 def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k: int) -> None:
     module = ssadnet.ContextModule(channels=1, width=1).eval()
@@ -100,6 +95,7 @@ def test_the_first_k_context_layers_have_the_receptive_field_of_table_1(k: int) 
     y[0, 0, 130, 67].backward()
     rows, cols = torch.nonzero(x.grad[0, 0], as_tuple=True)
     width, height = TABLE_1[k - 1][1]
+    assert receptive_field(ssadnet.CONTEXT_DILATIONS[:k]) == (width, height)
     assert (rows.min(), rows.max()) == (130 - height // 2, 130 + height // 2)
     assert (cols.min(), cols.max()) == (67 - width // 2, 67 + width // 2)
     assert len(rows) == width * height  # every cell of the field has an effect
@@ -298,53 +294,83 @@ def test_initial_weights_of_ssadnet_have_the_variance_that_elu_needs() -> None:
     assert boxes[:, 0].sigmoid().mean().item() == pytest.approx(ssadnet.HEAT_PRIOR, abs=0.03)
 
 
-# Channels, and by how much the width has shrunk.
+# Channels, and by how much height and width have shrunk: only the width of range images is halved.
 POINTSEG_STAGES = {
-    "fire1": (64, 2),
-    "fire3": (128, 4),
-    "sr1": (128, 4),
-    "sr2": (256, 8),
-    "fire7": (384, 16),
-    "sr3": (512, 16),
-    "enlarge": (128, 16),
-    "deconv1": (128, 8),
-    "deconv1_enlarged": (128, 8),
-    "deconv2": (128, 4),
-    "deconv3": (64, 2),
-    "deconv4": (64, 1),
-    "skip1": (64, 1),
+    "fire1": (64, 1, 2),
+    "fire3": (128, 1, 4),
+    "sr1": (128, 1, 4),
+    "sr2": (256, 1, 8),
+    "fire7": (384, 1, 16),
+    "sr3": (512, 1, 16),
+    "enlarge": (128, 1, 16),
+    "deconv1": (128, 1, 8),
+    "deconv1_enlarged": (128, 1, 8),
+    "deconv2": (128, 1, 4),
+    "deconv3": (64, 1, 2),
+    "deconv4": (64, 1, 1),
+    "skip1": (64, 1, 1),
 }
 SQUEEZESEG_STAGES = {
-    "fire1": (64, 2),
-    "context1": (64, 2),
-    "fire2": (128, 4),
-    "context2": (128, 4),
-    "context3": (128, 4),
-    "fire5": (256, 8),
-    "fire7": (384, 16),
-    "fire7b": (384, 16),
-    "fire9": (512, 16),
-    "deconv10": (256, 8),
-    "deconv11": (128, 4),
-    "deconv12": (64, 2),
-    "deconv13": (64, 1),
-    "skip1": (64, 1),
+    "fire1": (64, 1, 2),
+    "context1": (64, 1, 2),
+    "fire2": (128, 1, 4),
+    "context2": (128, 1, 4),
+    "context3": (128, 1, 4),
+    "fire5": (256, 1, 8),
+    "fire7": (384, 1, 16),
+    "fire7b": (384, 1, 16),
+    "fire9": (512, 1, 16),
+    "deconv10": (256, 1, 8),
+    "deconv11": (128, 1, 4),
+    "deconv12": (64, 1, 2),
+    "deconv13": (64, 1, 1),
+    "skip1": (64, 1, 1),
 }
+FUSED_STAGES = {f"stages.{k}": (128, 2**k, 2**k) for k in range(4)}
+SALSANEXT_STAGES = {"context": (32, 1, 1), "encoders.0": (64, 1, 1), "encoders.4": (256, 16, 16)}
+SALSANEXT_STAGES |= {"decoders.0": (128, 8, 8)}
+LEVELS = {f"heads.0.levels.{k}": stage for k, stage in enumerate(((256, 8, 8), (128, 4, 4), (64, 4, 4)))}
+PILLAR_STAGES = {"blocks.2": (256, 8, 8), "ups.2": (128, 2, 2)}
+ANCHORS, HEADS = [(n, 2, 2) for n in (2, 14, 4)], [(n, 4, 4) for n in N_BOX_VALUES.values()]
+RANGE_IMAGES, RIVALS_IMAGES = [(64, 512), (64, 2048)], [(64, 2048), (64, 512), (40, 90)]
 
 
-@pytest.mark.parametrize("width", [512, 2048])
+def shrunk(size: tuple[int, int], channels: int, down: int, across: int) -> tuple[int, ...]:
+    """The shape of a stage for two images of a size; odd ones are halved upwards."""
+    return 2, channels, -(-size[0] // down), -(-size[1] // across)
+
+
 @pytest.mark.parametrize(
-    ("make", "stages"), [(PointSeg, POINTSEG_STAGES), (SqueezeSegV2, SQUEEZESEG_STAGES), (KULSeg, SQUEEZESEG_STAGES)]
+    ("make", "n_channels", "sizes", "gets", "gives", "answers"),
+    [
+        (PointSeg, 5, RANGE_IMAGES, {"enlarge": (512, 1, 16)}, POINTSEG_STAGES, [(4, 1, 1)]),
+        (SqueezeSegV2, 5, RANGE_IMAGES, {}, SQUEEZESEG_STAGES, [(4, 1, 1)]),
+        (KULSeg, 5, RANGE_IMAGES, {}, SQUEEZESEG_STAGES, [(4, 1, 1)]),
+        (SalsaNext, 5, [(64, 2048), (64, 512), (32, 1024), (16, 16)], {}, SALSANEXT_STAGES, [(20, 1, 1)]),
+        # Five resolutions are fused.
+        (FIDNet, 5, RIVALS_IMAGES, {"head": (1024, 1, 1)}, FUSED_STAGES | {"stem": (512, 1, 1)}, [(20, 1, 1)]),
+        (CENet, 5, RIVALS_IMAGES, {"head": (640, 1, 1)}, FUSED_STAGES | {"stem": (128, 1, 1)}, [(20, 1, 1)]),
+        # Two anchors at half the resolution, five heads at a quarter of it
+        (PointPillars, 64, [(496, 432), (248, 216), (8, 16)], {}, PILLAR_STAGES, ANCHORS),
+        (SFA3D, 3, [(608, 608), (64, 96), (32, 32)], LEVELS, {"stages.3": (512, 32, 32)}, HEADS),
+    ],
 )
-def test_networks_of_range_images_halve_only_the_width(
-    make: Callable[[], torch.nn.Module], stages: dict[str, tuple[int, int]], width: int
+def test_stages_and_answers_have_the_described_shapes(
+    make: Callable[[], torch.nn.Module],
+    n_channels: int,
+    sizes: list[tuple[int, int]],
+    gets: dict[str, tuple[int, int, int]],
+    gives: dict[str, tuple[int, int, int]],
+    answers: list[tuple[int, int, int]],
 ) -> None:
-    logits, recorded = run_and_record(on_meta(make), torch.empty(2, 5, 64, width, device="meta"), *stages)
-    for name, (channels, shrink) in stages.items():
-        assert tuple(recorded[name][1].shape) == (2, channels, 64, width // shrink), name
-    assert logits.shape == (2, 4, 64, width)
-    if "enlarge" in stages:
-        assert recorded["enlarge"][0].shape[2:] == (64, width // 16)
+    network = on_meta(make)
+    for size in sizes:
+        found, recorded = run_and_record(network, torch.empty(2, n_channels, *size, device="meta"), *gets, *gives)
+        for k, stages in enumerate((gets, gives)):
+            for name, stage in stages.items():
+                assert tuple(recorded[name][k].shape) == shrunk(size, *stage), name
+        found = [found] if torch.is_tensor(found) else found
+        assert [tuple(answer.shape) for answer in found] == [shrunk(size, *answer) for answer in answers]
 
 
 @pytest.mark.parametrize(("make", "n", "width"), [(PointSeg, 4, 256), (KULSeg, 3, 128)])
@@ -607,40 +633,6 @@ def test_lodnn_edge_is_a_shortcut_before_training() -> None:
 # networks that are only measured against
 
 
-@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (32, 1024), (16, 16)])
-def test_salsanext_labels_every_pixel(height: int, width: int) -> None:
-    stages = {"context": (32, 1), "encoders.0": (64, 1), "encoders.4": (256, 16), "decoders.0": (128, 8)}
-    image = torch.empty(2, 5, height, width, device="meta")
-    logits, recorded = run_and_record(on_meta(SalsaNext), image, *stages)
-    for name, (channels, shrink) in stages.items():
-        assert tuple(recorded[name][1].shape) == (2, channels, height // shrink, width // shrink), name
-    assert logits.shape == (2, 20, height, width)
-
-
-@pytest.mark.parametrize(("height", "width"), [(496, 432), (248, 216), (8, 16)])
-def test_pointpillars_has_two_anchors_at_half_resolution(height: int, width: int) -> None:
-    image = torch.empty(1, 64, height, width, device="meta")
-    outputs, recorded = run_and_record(on_meta(PointPillars), image, "blocks.2", "ups.2")
-    assert tuple(recorded["blocks.2"][1].shape) == (1, 256, height // 8, width // 8)
-    assert tuple(recorded["ups.2"][1].shape) == (1, 128, height // 2, width // 2)
-    assert [tuple(output.shape) for output in outputs] == [(1, n, height // 2, width // 2) for n in (2, 14, 4)]
-
-
-@pytest.mark.parametrize(("height", "width"), [(64, 2048), (64, 512), (40, 90)])
-@pytest.mark.parametrize(("make", "stem", "fused"), [(FIDNet, 512, 1024), (CENet, 128, 640)])
-def test_fidnet_and_cenet_fuse_five_resolutions(
-    make: Callable[[], torch.nn.Module], stem: int, fused: int, height: int, width: int
-) -> None:
-    names = ["stem", *(f"stages.{k}" for k in range(4)), "head"]
-    logits, recorded = run_and_record(on_meta(make), torch.empty(2, 5, height, width, device="meta"), *names)
-    assert tuple(recorded["stem"][1].shape) == (2, stem, height, width)
-    for k in range(4):
-        expected = (2, 128, -(-height // 2**k), -(-width // 2**k))
-        assert tuple(recorded[f"stages.{k}"][1].shape) == expected
-    assert tuple(recorded["head"][0].shape) == (2, fused, height, width)
-    assert logits.shape == (2, 20, height, width)
-
-
 @pytest.mark.parametrize(("c_in", "c_out", "stride"), [(8, 8, 1), (8, 4, 1), (8, 8, 2), (4, 16, 2)])
 def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> None:
     block, x = Residual(c_in, c_out, stride, nn.ReLU).eval(), torch.randn(2, c_in, 7, 9)
@@ -648,18 +640,6 @@ def test_a_residual_block_adds_its_input(c_in: int, c_out: int, stride: int) -> 
     with torch.no_grad():
         agree(block(x), block.shortcut(x).relu())
     assert (len(block.shortcut) == 0) == (c_in == c_out and stride == 1)
-
-
-@pytest.mark.parametrize(("height", "width"), [(608, 608), (64, 96), (32, 32)])
-def test_sfa3d_has_five_heads_at_a_quarter_of_the_resolution(height: int, width: int) -> None:
-    image = torch.empty(1, 3, height, width, device="meta")
-    outputs, recorded = run_and_record(on_meta(SFA3D), image, "stages.3", *(f"heads.0.levels.{k}" for k in range(3)))
-    assert tuple(recorded["stages.3"][1].shape) == (1, 512, height // 32, width // 32)
-    shrinks = {f"heads.0.levels.{k}": shrink for k, shrink in enumerate((8, 4, 4))}
-    assert {name: height // recorded[name][0].shape[2] for name in shrinks} == shrinks
-    assert [tuple(output.shape) for output in outputs] == [
-        (1, n, height // 4, width // 4) for n in N_BOX_VALUES.values()
-    ]
 
 
 @pytest.mark.parametrize("size", [32, 64, 96])
