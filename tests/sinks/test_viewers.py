@@ -9,7 +9,6 @@ import os
 import socket
 import struct
 import threading
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -23,8 +22,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_pages import HOSTILE, opened, perceived
-from test_pictures import CAR, VAN, a_perception, a_scan, scene_of, unpacked
+from test_pages import HOSTILE, perceived
+from test_pictures import CAR, VAN, a_perception, a_scan, has_webgl, opened, opened_in_webgl, scene_of, unpacked
 
 from cli_helpers import Shell, thinned
 from edgeperc import Mounting, Tracker, read_scans
@@ -45,6 +44,7 @@ from edgeperc.view import DrivePage
 from edgeperc.view.colors import CLASS_COLORS
 from edgeperc.view.content import box_corners
 from scenes import rotation_of
+from waiting import until
 
 SENSOR = get_sensor("hdl-64e")
 TILTED = Mounting(2.1, 5.0, -3.0, 90.0)
@@ -657,7 +657,7 @@ def test_names_are_only_text_on_the_page_of_a_drive(browser: Any, tmp_path: Path
         if names is HOSTILE:
             (tmp_path / "hostile.html").write_text(pages[-1])
     shown, wrong = opened(browser, tmp_path / "hostile.html")
-    if shown.evaluate("!!document.createElement('canvas').getContext('webgl')"):
+    if has_webgl(shown):
         for _ in HOSTILE:
             shown.keyboard.press(".")
         assert "18 of 18" in shown.inner_text("#now")
@@ -669,21 +669,10 @@ def test_names_are_only_text_on_the_page_of_a_drive(browser: Any, tmp_path: Path
 def test_the_play_bar_plays(browser: Any, tmp_path: Path) -> None:
     # A second between scans, so that a slow browser is far from the end when the test pauses.
     write(PageSink(tmp_path / "drive.html"), [replace(scan, stamp_s=float(k)) for k, scan in enumerate(a_run())])
-    page, wrong = browser.new_page(viewport={"width": 1000, "height": 700}), []
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.goto((tmp_path / "drive.html").as_uri())
-    if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
-        pytest.skip("this browser has no WebGL")
+    page, wrong = opened_in_webgl(browser, tmp_path / "drive.html", viewport={"width": 1000, "height": 700})
 
     def at() -> int:
         return int(page.input_value("#at"))
-
-    def until(reached: Callable[[], bool]) -> None:
-        for _ in range(300):
-            if reached():
-                return
-            time.sleep(0.1)
-        raise AssertionError(at())
 
     assert page.is_visible("#play")
     assert at() == 0
@@ -727,13 +716,9 @@ def test_the_play_bar_plays(browser: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (390, 844), (844, 390), (820, 1180)])
 def test_the_page_on_a_touch_screen(browser: Any, tmp_path: Path, width: int, height: int) -> None:
     """The scene is free, everything is on the screen and reached by a finger."""
-    write(PageSink(tmp_path / "a rather long name of a drive.html"), a_run())
-    context = browser.new_context(viewport={"width": width, "height": height}, has_touch=True, is_mobile=True)
-    page, wrong = context.new_page(), []
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.goto((tmp_path / "a rather long name of a drive.html").as_uri())
-    if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
-        pytest.skip("this browser has no WebGL")
+    path, screen = tmp_path / "a rather long name of a drive.html", {"width": width, "height": height}
+    write(PageSink(path), a_run())
+    page, wrong = opened_in_webgl(browser, path, viewport=screen, has_touch=True, is_mobile=True)
 
     def rectangle(name: str) -> tuple[float, float, float, float]:
         box = page.locator(name).bounding_box()
@@ -767,15 +752,15 @@ def test_the_page_on_a_touch_screen(browser: Any, tmp_path: Path, width: int, he
     page.tap("summary")
     assert not page.evaluate("document.getElementById('panel').open")
     assert not wrong
-    context.close()
+    page.close()
 
 
 def test_a_page_of_one_scan_has_no_play_bar(browser: Any, tmp_path: Path) -> None:
     write(PageSink(tmp_path / "drive.html"), a_run(8)[-1:])
-    page = browser.new_page()
-    page.goto((tmp_path / "drive.html").as_uri())
+    page, wrong = opened(browser, tmp_path / "drive.html")
     assert not page.is_visible("#play")
     assert "1 scan (all)" in page.content()
+    assert not wrong
     page.close()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_pictures import a_perception, a_scan, scene_of
+from test_pictures import a_perception, a_scan, has_webgl, opened, scene_of
 
 from edgeperc import Tracker
 from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
@@ -123,18 +123,6 @@ def test_any_name_is_only_text(tmp_path_factory: pytest.TempPathFactory, title: 
     assert elements.text["h1"].strip() == printable(title or "A scan").strip()
 
 
-def opened(browser: Any, path: Path) -> tuple[Any, list[str]]:
-    """A page, and what went wrong on it: errors, messages, and requests for anything but the page."""
-    wrong: list[str] = []
-    page = browser.new_page()
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("console", lambda message: wrong.append(message.text))
-    page.on("request", lambda request: request.url == path.as_uri() or wrong.append(request.url))
-    page.goto(path.as_uri())
-    page.wait_for_timeout(100)
-    return page, wrong
-
-
 def test_no_name_runs_on_the_page(browser: Any, tmp_path: Path) -> None:
     scan = a_scan()[5990:6700]
     for title in HOSTILE[:12]:
@@ -142,7 +130,7 @@ def test_no_name_runs_on_the_page(browser: Any, tmp_path: Path) -> None:
         page, wrong = opened(browser, tmp_path / "page.html")
         assert page.text_content("h1") == printable(title)
         assert page.evaluate("window.stolen") is None
-        if page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
+        if has_webgl(page):
             listed = page.evaluate(
                 "[...document.querySelectorAll('#classes label')].map(row => row.childNodes[2].textContent)"
             )

@@ -597,16 +597,34 @@ def test_pictures_are_drawn_on_the_ground_of_the_perception() -> None:
     assert ground_plane(unknown, points[:0]) == (-1.73, 0.0, 0.0)
 
 
-def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
-    write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
+def opened(browser: Any, path: Path, **how: Any) -> tuple[Any, list[str]]:
+    """A page, and what went wrong on it: errors, messages, and requests for anything but the page."""
     wrong: list[str] = []
-    page = browser.new_page(viewport={"width": 1000, "height": 700})
+    page = browser.new_page(**how)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("console", lambda message: wrong.append(message.text))
-    page.on("request", lambda request: request.url.startswith("file:") or wrong.append(request.url))
-    page.goto((tmp_path / "page.html").as_uri())
-    if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
-        pytest.skip("this browser offers no WebGL")
+    page.on("request", lambda request: request.url == path.as_uri() or wrong.append(request.url))
+    page.goto(path.as_uri())
+    page.wait_for_timeout(100)
+    return page, wrong
+
+
+def has_webgl(page: Any) -> bool:
+    """Whether the browser draws the scan."""
+    return bool(page.evaluate("!!document.createElement('canvas').getContext('webgl')"))
+
+
+def opened_in_webgl(browser: Any, path: Path, **how: Any) -> tuple[Any, list[str]]:
+    """As `opened`, where the browser draws the scan."""
+    page, wrong = opened(browser, path, **how)
+    if not has_webgl(page):
+        pytest.skip("this browser has no WebGL")
+    return page, wrong
+
+
+def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
+    write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
+    page, wrong = opened_in_webgl(browser, tmp_path / "page.html", viewport={"width": 1000, "height": 700})
     assert page.inner_text("h1") == "a <b>scan</b>"
 
     def shown(name: str) -> int:
