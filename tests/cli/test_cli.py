@@ -157,15 +157,6 @@ def test_help_of_eval_and_wrong_usage(shell: Shell) -> None:
     assert "invalid choice: 'some'" in shell.err("eval", "simulation:1", "--split", "some")
 
 
-def test_eval_needs_matplotlib_for_a_picture_before_any_work(
-    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    written = ("--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json")
-    assert "pip install 'edgeperc[view]'" in shell.err("eval", "simulation:1", *written)
-    assert not (tmp_path / "out").exists()
-
-
 def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     asked = []
 
@@ -760,13 +751,18 @@ def test_a_file_that_cannot_be_written_fails_its_scan_alone(tmp_path: Path, shel
     assert (tmp_path / "out" / "b.label").stat().st_size == 160
 
 
+@pytest.mark.parametrize(
+    "words", ["run a.bin --png --out out", "eval simulation:1 --worst worst.png --json out/a.json"]
+)
 def test_missing_matplotlib_is_said_before_any_work(
-    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
+    words: str, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    scan = write_scan(tmp_path / "a.bin")
-    assert "pip install 'edgeperc[view]'" in shell.err("run", scan, "--png", "--out", tmp_path / "out")
+    write_scan(tmp_path / "a.bin")
+    assert "pip install 'edgeperc[view]'" in shell.err(*words.split())
     assert fake.made == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_interrupted(tmp_path: Path, shell: Shell) -> None:
