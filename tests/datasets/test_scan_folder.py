@@ -377,12 +377,10 @@ def test_a_training_tells_of_remissions_and_of_scans_twice(tmp_path: Path, monke
     from edgeperc_export.training.train import Data, Run, train
 
     splits = {"train": ["3"], "validation": ["4"]}
-    root, _ = street(tmp_path, drives="scan", splits=splits, sensor="hdl-64e")
+    root, _ = street(tmp_path, "hdl-64e", most=100, drives="scan", splits=splits)
     for file in (root / "velodyne/3.bin", root / "label/3.txt", root / "semseg/3.u8"):
         shutil.copy(file, file.with_stem("4"))
     description = json.loads((root / "scans.json").read_text())
-    description["sensor"]["remission_range"] = [0, 100]
-    (root / "scans.json").write_text(json.dumps(description))
     with (
         pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"),
         pytest.raises(ValueError, match="validation scan street/4 is the training scan street/3, byte for byte"),
@@ -406,10 +404,7 @@ def test_a_training_tells_of_remissions_and_of_scans_twice(tmp_path: Path, monke
 def test_an_evaluation_tells_of_another_unit_and_of_labels_of_another_scan(
     tmp_path: Path, measure: Callable[..., Any]
 ) -> None:
-    root, _ = street(tmp_path, drives="scan", splits={"test": ["3"]}, sensor="hdl-64e")
-    description = json.loads((root / "scans.json").read_text())
-    description["sensor"]["remission_range"] = [0, 100]
-    (root / "scans.json").write_text(json.dumps(description))
+    root, _ = street(tmp_path, "hdl-64e", most=100, drives="scan", splits={"test": ["3"]})
     (root / "label/3.txt").write_text("".join(f"car {x} 0 0.4 4 2 1.6 0\n" for x in (5, 9, 13, 17)))
     with (
         pytest.warns(UserWarning, match=r"of 1 of 1 scans, the remission does not fit the range 0 to 100 of hdl-64e"),
@@ -611,8 +606,12 @@ def test_cells_in_polygons(polygons: list[list[tuple[float, float]]]) -> None:
 CARS = [Box("car", 1.0, (x, y, -0.95), (4.2, 1.8, 1.5), 0.1) for x, y in ((9, 4), (16, -4), (22, 4), (-12, 4), (30, 1))]
 
 
-def street(root: Path, sensor: str = "vlp-32c", seeds: tuple[int, ...] = (3,), **changes: Any) -> tuple[Path, Any]:
-    """Simulated scans of a sensor whose frame has its origin 0.4 m above the road, with labels of every kind."""
+def street(
+    root: Path, sensor: str = "vlp-32c", seeds: tuple[int, ...] = (3,), *, most: int = 255, **changes: Any
+) -> tuple[Path, Any]:
+    """Simulated scans of a sensor whose frame has its origin 0.4 m above the road, with labels of every kind; ``most``:
+    remission that the description says is the highest, of 0..255.
+    """
     for part in ("velodyne", "label", "semseg"):
         (root / part).mkdir(parents=True)
     shift = np.array([0.0, 0.0, get_sensor(sensor).mount_height_m - 0.4], np.float32)
@@ -637,7 +636,7 @@ def street(root: Path, sensor: str = "vlp-32c", seeds: tuple[int, ...] = (3,), *
     description = {
         "schema": 1,
         "name": "street",
-        "sensor": {"like": sensor, "remission_range": [0, 255]},
+        "sensor": {"like": sensor, "remission_range": [0, most]},
         "boxes": {name: name for name in ("car", "van", "truck", "pedestrian", "cyclist")} | {"*": "ignore"},
         "points": {"other": "background", "road": "drivable", "car": "car", "*": "ignore"}
         | {name: name for name in ("pedestrian", "cyclist")},

@@ -40,11 +40,15 @@ def clustered(scan: SimulatedScan) -> tuple[ObjectNetwork, Scan, Candidates]:
     return network, seen, network.cluster(seen, "both", 0.0)
 
 
+def true_boxes(scan: SimulatedScan, label: str, least_returns: int) -> list[Box]:
+    """The true boxes of a class with so many returns."""
+    boxes = zip(scan.boxes, scan.box_points, strict=True)
+    return [box for box, n in boxes if box.label == label and n >= least_returns]
+
+
 def near_true(perception: Perception, scan: SimulatedScan, least_returns: int = 100) -> float:
     """Share of the true cars with so many returns that have a vehicle's box within 1 m."""
-    cars = [
-        box for box, n in zip(scan.boxes, scan.box_points, strict=True) if n >= least_returns and box.label == "car"
-    ]
+    cars = true_boxes(scan, "car", least_returns)
     found = np.array([box.center[:2] for box in perception.boxes if box.label in ("car", "van", "truck")])
     hits = [len(found) and np.hypot(*(found - box.center[:2]).T).min() < 1.0 for box in cars]
     return float(np.mean(hits))
@@ -74,7 +78,7 @@ def test_the_network_of_objects_needs_no_other_one(scan: SimulatedScan) -> None:
 
 def test_people_are_the_networks_where_no_labels_box_them() -> None:
     scan = simulated_scan(1)
-    people = [b.center for b, n in zip(scan.boxes, scan.box_points, strict=True) if b.label == "pedestrian" and n > 60]
+    people = [box.center for box in true_boxes(scan, "pedestrian", 61)]
     boxes = Perceiver("objects", n_threads=1)(scan.points).boxes
     found = [box.center for box in boxes if box.label == "pedestrian"]
     assert people
@@ -152,8 +156,7 @@ def test_what_a_look_shows_is_looked_at_from_its_other_end(
 def test_a_riders_box_is_the_mean_of_that_of_the_labels_and_of_the_networks(scan: SimulatedScan) -> None:
     """It has the network's heading, whose front is known; where the network sees no rider, it stays."""
     network, seen, clusters = clustered(scan)
-    boxes = zip(scan.boxes, scan.box_points, strict=True)
-    true = next(box for box, n in boxes if box.label == "cyclist" and n > 100)
+    true = true_boxes(scan, "cyclist", 101)[0]
     x, y, z = true.center
     labeled = replace(true, score=0.9, center=(x + 0.2, y - 0.1, z), yaw=true.yaw + math.pi, front=None)
     higher = replace(labeled, center=(x + 0.2, y - 0.1, z + 0.1), size=(*true.size[:2], true.size[2] + 0.2))
@@ -188,8 +191,7 @@ def test_of_two_boxes_at_one_vehicle_the_better_one_stays(scan: SimulatedScan) -
     had none.
     """
     network, seen, clusters = clustered(scan)
-    boxes = zip(scan.boxes, scan.box_points, strict=True)
-    true = next(box for box, n in boxes if box.label == "car" and n > 300)
+    true = true_boxes(scan, "car", 301)[0]
     x, y, z = true.center
     shown = replace(true, score=0.9)
     askew = replace(true, score=0.55, center=(x + 1.5, y + 1.0, z), yaw=true.yaw + 0.8)
