@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -85,17 +85,14 @@ def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
     """
     from faster_coco_eval.core import mask as coco
 
-    def annotations() -> Iterator[str]:
-        n = 0
+    def annotations() -> Iterator[dict[str, Any]]:
         for image_id, scene in enumerate(database, 1):
             masks = [(CLASSES.index(b.label), road_and_vehicles(np.zeros_like(scene.map), [b])) for b in scene.boxes]
             for category, mask in [(1, scene.map == 1), *masks]:
                 if not mask.any():
                     continue
-                n += 1
                 runs = coco.encode(np.asfortranarray(mask != 0, np.uint8))
-                entry = {
-                    "id": n,
+                yield {
                     "image_id": image_id,
                     "category_id": category,
                     "area": int(coco.area(runs)),
@@ -103,7 +100,6 @@ def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
                     "segmentation": {"size": [HEIGHT, WIDTH], "counts": runs["counts"].decode()},
                     "iscrowd": 0,
                 }
-                yield json.dumps(entry)
 
     images = [
         {"id": k, "file_name": f"{name}.png", "width": WIDTH, "height": HEIGHT}
@@ -113,6 +109,6 @@ def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
     file.write(f'{{"images": {json.dumps(images)},\n"categories": {json.dumps(categories)},\n"annotations": [')
     n = 0
     for n, entry in enumerate(annotations(), 1):
-        file.write(f"{',' if n > 1 else ''}\n{entry}")
+        file.write(f"{',' if n > 1 else ''}\n{json.dumps({'id': n, **entry})}")
     file.write("\n]}\n")
     return n
