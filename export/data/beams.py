@@ -14,9 +14,8 @@ from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile
 from edgeperc.types.views import RangeImageGeometry
 
-from .scans import LabeledScan
+from .scans import TRAINING_SENSOR, LabeledScan
 
-TRAINING_SENSOR = SENSORS["hdl-64e"]
 # How often one with random beams, a known one that spins and one without beams is drawn.
 SHARES = (0.35, 0.45, 0.2)
 SPARSE_SHARES = (0.15, 0.6, 0.25)

@@ -17,11 +17,12 @@ from edgeperc.system.atomic import open_atomic
 from edgeperc.types.geometry import draw_footprints, inside
 from edgeperc.types.perception import Box
 from edgeperc.types.points import Bytes, Floats32, Labels, Mask, Points
-from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.sensor import SENSORS, SensorProfile
 from edgeperc.types.views import TopViewGeometry
 
 # Wider and coarser than the network's view, so that a turned scan has ground truth everywhere in the view.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
+TRAINING_SENSOR = SENSORS["hdl-64e"]
 CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees to the right and 40.2 to the left
 
 

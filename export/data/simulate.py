@@ -21,9 +21,7 @@ from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile, get_sensor
 
 from .processes import mapped
-from .scans import LabeledScan, opened
-
-TRAINING_SENSOR = "hdl-64e"
+from .scans import TRAINING_SENSOR, LabeledScan, opened
 
 
 def simulate(
@@ -70,7 +68,7 @@ def _check_kept(out: Path, seeds: range, sensor: SensorProfile, place: str) -> N
     for path in filter(Path.exists, (_path(out, seed) for seed in seeds)):
         with opened(path) as data:
             profile, taken_at = (str(data[name]) if name in data else "" for name in ("sensor", "place"))
-        kept = SensorProfile.from_json(profile) if profile else get_sensor(TRAINING_SENSOR)
+        kept = SensorProfile.from_json(profile) if profile else TRAINING_SENSOR
         if kept != sensor:
             other = "another " * (kept.name == sensor.name)
             raise ValueError(
@@ -87,7 +85,7 @@ def _simulate(
     boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
     simulated = simulated_scan(seed, sensor, boxes, where=where, clumped_leaves=True)
     scan = LabeledScan.from_simulation(in_models_frame(simulated, sensor))
-    if sensor != get_sensor(TRAINING_SENSOR):
+    if sensor != TRAINING_SENSOR:
         scan = replace(scan, sensor=sensor.upright(sensor.mounting))
     scan.save(_path(out, seed), place)
 

@@ -54,12 +54,11 @@ from edgeperc.simulation import samples
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats, Floats32, Ints64
-from edgeperc.types.sensor import get_sensor
 
 from ..data.beams import drawn_sensor, taken_by
 from ..data.scan_sets import check_trains, read_scan_set
-from ..data.scans import LabeledScan
-from ..data.simulate import TRAINING_SENSOR, parity_samples
+from ..data.scans import TRAINING_SENSOR, LabeledScan
+from ..data.simulate import parity_samples
 from .int8_graph import equalize, repeat_pixels
 from .to_onnx import halve, pixel_labels, sets_of, terms_of, views, write_checked
 
@@ -138,7 +137,7 @@ def calibration_scans(
     frames: dict[str, str] = {}
     for file in files:
         points = read_points(file)
-        found = check_fitness(points, fitness, get_sensor(TRAINING_SENSOR)) if fitness is not None else ()
+        found = check_fitness(points, fitness, TRAINING_SENSOR) if fitness is not None else ()
         if gross := next((finding for finding in found if finding.gross), None):
             raise PointsError(
                 f"{file} is not as the network sees scans ({gross}) Give scans of another sensor as --scans FOLDER, "

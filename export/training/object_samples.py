@@ -28,12 +28,10 @@ from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING
 from edgeperc.types.perception import Box
 from edgeperc.types.points import Floats, Floats32, Ints, Ints64, Labels, Mask, read_only
-from edgeperc.types.sensor import get_sensor
 
 from ..cards import BOX_SIZES, OBJECT_CLASSES, OBJECT_VIEW
 from ..data.processes import mapped
-from ..data.scans import LabeledScan
-from ..data.simulate import TRAINING_SENSOR
+from ..data.scans import TRAINING_SENSOR, LabeledScan
 from .object_task import VEHICLE
 
 DriveScan = tuple[str, Callable[[], LabeledScan]]
@@ -169,7 +167,7 @@ def samples_of(
     scan = Scan.of(points, find_ground(points, mount_height_m=MODEL_HEIGHT_M))
     cells = sort_into_cells(scan, OBJECT_VIEW.height_range_m)
     detected = rectangles(perceive(points).boxes if perceive is not None else ())
-    sensor = labeled.sensor or get_sensor(TRAINING_SENSOR)
+    sensor = labeled.sensor or TRAINING_SENSOR
     groups = find_candidates(scan, cells, sensor.link_per_m).rectangles
     truths = [(box, n) for box, n in zip(labeled.boxes, labeled.counts, strict=True)]
     boxes = [box for box, _ in truths]
