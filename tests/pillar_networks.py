@@ -101,7 +101,7 @@ def inputs_of(card: ModelCard, points: NDArray[np.float32]) -> tuple[Tensor, ...
     return tuple(torch.from_numpy(each[:n].copy()) for each in maker.pillars)
 
 
-def target_of(kind: str, boxes: Sequence[Box]) -> list[tuple[int, int, int, tuple[float, ...]]]:
+def target_of(boxes: Sequence[Box]) -> list[tuple[int, int, int, tuple[float, ...]]]:
     """Class, row, column and values of the boxes in view."""
     found = []
     shrink = STRIDE * VIEW.cell_m
@@ -118,7 +118,7 @@ def loss_of(kind: str, outputs: Sequence[Tensor], boxes: Sequence[Box]) -> Tenso
     """What is wrong with the outputs, at the cells of the centers alone; elsewhere there is no object."""
     loss, heat = torch.zeros(()), outputs[0]
     wanted = torch.zeros_like(heat)
-    for label, row, column, (x, y, z, length, width, height, yaw) in target_of(kind, boxes):
+    for label, row, column, (x, y, z, length, width, height, yaw) in target_of(boxes):
         if kind == "anchors":
             turned = int(abs(math.sin(yaw)) > abs(math.cos(yaw)))
             anchor, size = 2 * label + turned, ANCHORS[label].size_m

@@ -26,7 +26,6 @@ from scenes import assert_same
 
 AHEAD = RangeImageGeometry((2.0, -10.0, -24.0))
 TOP = TopViewGeometry()
-View = RangeImageGeometry | TopViewGeometry
 # The first example compiles a kernel.
 
 coordinates = st.floats(-80.0, 80.0, width=32) | st.sampled_from([0.0, -0.0, math.nan, math.inf, -math.inf, 3e38])
