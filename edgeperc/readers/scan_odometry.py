@@ -21,7 +21,7 @@ LONGEST_STEP_S = 1.0
 # of a first step of 1.3 or 2.6 m (KITTI's drive 0001, thinned to 16 and 32 beams), with it at most 0.3 m.
 CELL_M, REACH, STANDING_M = 0.5, 10, 0.6
 SPACE = np.array([256, 256, 64])  # cells around the sensor
-THRESHOLD_M = 0.5  # KISS-ICP's first one, in place of 2 m
+THRESHOLD_M = 0.5  # KISS-ICP's, for the step that was looked for, in place of 2 m
 
 
 class Odometry:
@@ -47,7 +47,8 @@ class Odometry:
         self._settings = require("kiss_icp.config", "slam", "Odometry", package="kiss-icp").load_config(None)
         self._settings.data.deskew = False
         self._settings.registration.max_num_threads = 1
-        self._settings.adaptive_threshold.initial_threshold = THRESHOLD_M
+        threshold = require("kiss_icp.threshold", "slam", "Odometry", package="kiss-icp").FixedThreshold
+        self._first_threshold = threshold(THRESHOLD_M)
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +57,7 @@ class Odometry:
         self._begin(np.eye(4))
 
     def _begin(self, T_world_sensor: Floats) -> None:
-        self.T_world_sensor, self._is_first = T_world_sensor, True
+        self.T_world_sensor, self._n_scans = T_world_sensor, 0
         self._odometry = self._made(self._settings)
         self._odometry.last_pose = T_world_sensor
 
@@ -92,7 +93,11 @@ class Odometry:
         if step != "late" and len(finite):
             if last_s is not None:
                 is_known = self._expect(finite, last_s, stamp_s, step == "next")
+            usual, self._n_scans = self._odometry.adaptive_threshold, self._n_scans + 1
+            if self._n_scans == 2:
+                self._odometry.adaptive_threshold = self._first_threshold
             self._odometry.register_frame(finite, np.zeros(0))
+            self._odometry.adaptive_threshold = usual
             self.T_world_sensor = np.array(self._odometry.last_pose, np.float64)
         self._clock = clock if len(finite) else self._clock
         return self.T_world_sensor.copy() if is_known else None
@@ -101,13 +106,13 @@ class Odometry:
         """Expect the next scan where the last motion leads until its time; whether it is known."""
         step_s, before_s = elapsed_s(last_s, stamp_s), self._step_s
         motion = part_of(self._odometry.last_delta, step_s / before_s) if before_s else np.eye(4)
-        self._step_s, was_first = step_s, self._is_first
+        self._step_s = step_s
         if is_next:
-            if was_first:
+            if self._n_scans == 1:
                 to_sensor = np.linalg.inv(self.T_world_sensor)
                 before = self._odometry.local_map.point_cloud() @ to_sensor[:3, :3].T + to_sensor[:3, 3]
                 motion[:2, 3] = first_shift(before, self._odometry.voxelize(scan)[1])
-            self._odometry.last_delta, self._is_first = motion, False
+            self._odometry.last_delta = motion
             return True
         warnings.warn(
             f"{stamp_s - last_s:.1f} s from one scan to the next: how the sensor moved is not known; expected at most "
