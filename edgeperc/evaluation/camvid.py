@@ -18,7 +18,7 @@ from ..datasets.images import FOLDERS, LEVEL, LabeledImages, image_hash
 from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
 from ..types.card import ModelCard
-from ..types.points import Floats, Ints64
+from ..types.points import Bytes, Floats, Ints64
 from .judge import training_scans_of
 from .metrics import Confusion, mean
 from .truth import check_different
@@ -52,9 +52,7 @@ def evaluate_images(
     counts = []
     for done, (each, file) in enumerate(files, start=1):
         image, truth = each.read(file)
-        for name, hashes in trained_on.items():
-            if image_hash(image) in hashes:
-                raise SplitError(f"{name} was trained on {file}; evaluate other images, or ask for split 'train'")
+        check_unseen_image(trained_on, image, file)
         confusion = Confusion(card.classes)
         confusion.update(perceive(image=image).require_image().labels, truth)
         counts.append(confusion.counts)
@@ -66,6 +64,15 @@ def evaluate_images(
         "fold": None,
         "images": image_figures(card.classes, np.stack(counts)),
     }
+
+
+def check_unseen_image(trained_on: Mapping[str, set[str]], image: Bytes, file: Path) -> None:
+    """Raise `SplitError` if one of the models was trained on this image (see `training_scans_of`)."""
+    for name, hashes in trained_on.items():
+        if image_hash(image) in hashes:
+            raise SplitError(
+                f"{name} was trained on {file}; evaluate other images, or, with 'edgeperc eval', ask for split 'train'"
+            )
 
 
 def check_classes(data: LabeledImages, card: ModelCard) -> None:

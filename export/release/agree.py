@@ -22,8 +22,8 @@ from edgeperc.datasets.layout import class_number
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.datasets.splits import names_of
 from edgeperc.errors import ModelError, PointsError
-from edgeperc.evaluation.camvid import check_classes
-from edgeperc.evaluation.judge import Judge, Perceiving
+from edgeperc.evaluation.camvid import check_classes, check_unseen_image
+from edgeperc.evaluation.judge import Judge, Perceiving, check_unseen, training_scans_of
 from edgeperc.evaluation.kitti_ap import FrontTruth, average_precisions, best_candidates, count_in_image, image_size_of
 from edgeperc.evaluation.metrics import Confusion, Listed, mean
 from edgeperc.evaluation.tables import Record, figures
@@ -178,6 +178,7 @@ def _measure(
             objects = KittiObjects(kitti)
             for name in few(names_of(objects, split), n_scans):
                 frame = objects.frame(name)
+                check_unseen(judge.trained_on, name, frame.drive, frame.points)  # before it is thinned
                 truth = judge.kitti(frame if sparse is None else thinned(frame, sparse))
                 yield "real", judge, truth, judge.perceive(truth.points), None
         if semantickitti is not None and judge.from_above is not None:
@@ -220,9 +221,11 @@ def _measure_objects(
         on_mismatch="ignore",
     )
     session = next(session for session in perceive.sessions if session.card.view.kind == "objects")
+    trained_on = training_scans_of([session.card])
     labels, overlaps, table = [], [], Listed()
     for name in few(names_of(objects, split), n_scans):
         frame = objects.frame(name)
+        check_unseen(trained_on, name, frame.drive, frame.points)
         truth = FrontTruth(frame.labels or NO_LABELS, frame.calibration, image_size_of(frame.drive))
         boxes = perceive(frame.points).boxes
         table += count_in_image(truth, boxes, frame.drive)
@@ -240,9 +243,11 @@ def _measure_images(
     check_classes(data, variant.card)
     perceive = Perceiver([variant.path])
     by = _engine(perceive.sessions[0], precision)
+    trained_on = training_scans_of(perceive.cards)
     labels, confusion = [], Confusion(variant.card.classes)
     for file in few(data.files(split), n_images):
         image, truth = data.read(file)
+        check_unseen_image(trained_on, image, file)
         found = perceive(image=image).require_image()
         labels.append(found.labels.ravel())
         confusion.update(found.labels, truth)

@@ -18,7 +18,7 @@ onnx = pytest.importorskip("onnx")
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.datasets.layout import ScanLayout
 from edgeperc.datasets.scan_folder import ScanFolder
-from edgeperc.errors import CardMismatchError, ModelError, PointsError
+from edgeperc.errors import CardMismatchError, ModelError, PointsError, SplitError
 from edgeperc.inference.session import Session
 from edgeperc.system.machine import cpu_features
 from edgeperc.types.card import ModelCard
@@ -116,5 +116,8 @@ def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Pa
         patch.setattr(module, "figures", lambda *_: {**found, "boxes": {"oriented": {"all": {"vehicle": next(rows)}}}})
         both = {"kitti": kitti_root, "labeled": [ScanFolder(kitti_root / "training", layout)]}
         assert agree(paths, **both, split="test", n_scans=1)["int8"]["ap"] == 0.6
+    for model in ("pointseg", "pointseg-sparse", "objects"):
+        with pytest.raises(SplitError, match=f"{model} .* was trained on scan"):
+            agree([Path(shutil.copy(model_path(model), tmp_path))], kitti=kitti_root, split="train", n_scans=1)
     for variant, path in zip(resolve("pointseg"), paths, strict=True):
         assert onnx.load(path).graph == onnx.load(variant.path).graph

@@ -504,6 +504,8 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     assert ModelCard.read(out).precisions["int8"] == records["int8"]
     with pytest.raises(PointsError, match="is of a camera"):
         agree([trained[1]], kitti=drawn)
+    with pytest.raises(SplitError, match="; evaluate other images, or, with"):
+        agree([trained[1]], kitti=None, camvid=drawn, split="train")
 
 
 def test_comparison_is_one_command(drawn: Path, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
