@@ -198,8 +198,8 @@ def tell_beyond(folder: Path, sensor: SensorProfile, scans: Iterable[tuple[str, 
     n, beyond = 0, list[tuple[str, float]]()
     for name, points in scans:
         n += 1
-        if not (is_missing(points) or matcher.is_in_range(points)):
-            beyond.append((name, float(np.nanmax(points[:, 3], initial=low))))
+        if np.isfinite(points[:, 3]).any() and not (is_missing(points) or matcher.is_in_range(points)):
+            beyond.append((name, float(np.nanmax(points[:, 3]))))
     if beyond:
         name, most = beyond[0]
         warnings.warn(

@@ -7,6 +7,7 @@ beams of a coarser sensor it fills the range image as `edgeperc.Perceiver` does.
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -18,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import scan_hash
-from edgeperc.datasets.layout import IGNORED
+from edgeperc.datasets.layout import IGNORED, class_number
 from edgeperc.datasets.scan_folder import ScanFolder, ScanFrame
 from edgeperc.errors import MountingError
 from edgeperc.evaluation.truth import road_cells
@@ -92,6 +93,16 @@ def read_scan_set(
         sensor = replace(layout.sensor, remission=NO_REMISSION) if is_missing(frame.points) else sensors[frame.drive]
         points, _ = condition(frame.points, sensor)
         scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
+    of_labels = {class_number(name, classes) for name in (*layout.boxes.values(), *layout.points.values())}
+    is_labeled = any(frame.boxes is not None or frame.point_classes is not None for frame in frames)
+    # Other sets and simulated scans show what this one lacks, and hide that its objects are taught as background.
+    if is_labeled and of_labels - {0, IGNORE} and not any((scan.labels % IGNORE).any() for scan in scans):
+        warnings.warn(
+            f"{folder.root}: no point of its scans of split {split} ({len(scans)}) is of {', '.join(classes[1:])}; "
+            "check that boxes and points of its description have the names in the label files, and that these are of "
+            "the scans, in their frame",
+            stacklevel=2,
+        )
     weights = [n_scans[frame.drive] ** -0.5 for frame in frames]
     return Labeled(scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames})
 

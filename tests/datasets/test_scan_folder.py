@@ -704,6 +704,11 @@ def test_scans_to_train_on(tmp_path: Path) -> None:
     assert set(np.unique(own[0].labels)) <= {0, 1, 2, IGNORE}
     assert np.count_nonzero(own[0].labels == 2) == np.count_nonzero(scans[0].labels == 1)
     assert read_scan_set(folder, "validation") == ([], [], {})
+    np.save(root / "velodyne/5.npy", np.empty((0, 4), np.float32))  # its remission is in no other unit
+    (root / "semseg/5.u8").touch()
+    assert len(read_scan_set(ScanFolder(root), "train").scans) == 3
+    with pytest.warns(UserWarning, match=r"no point of its scans of split train \(3\) is of pedestrian; check that"):
+        read_scan_set(ScanFolder(root), "train", classes=("background", "pedestrian"))
 
 
 def test_road_between_the_returns_is_road(tmp_path: Path) -> None:
