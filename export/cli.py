@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from edgeperc import __version__
 from edgeperc.cli.arguments import Options, count, keywords, options, positive, positive_number
-from edgeperc.cli.output import print_error, print_line
+from edgeperc.cli.output import make_places, print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import CardError, CardMismatchError, EdgepercError, MissingExtraError, ModelError, OptionError
 from edgeperc.types.choices import PLACES
@@ -278,7 +278,7 @@ def _export(args: argparse.Namespace) -> None:
         metrics = dict(json.loads(_json_text(args.metrics))) if args.metrics else None
     except (TypeError, ValueError) as exc:
         raise OptionError(f"{args.metrics} has no figures, as edgeperc eval --json writes them: {exc}") from exc
-    args.out.parent.mkdir(parents=True, exist_ok=True)
+    make_places(args.out)
     card = export(
         args.checkpoint,
         args.out,
@@ -399,7 +399,7 @@ def _quantize(args: argparse.Namespace) -> None:
     from .release.quantize import LabeledSets, calibration_images, calibration_scans, quantize
 
     card = ModelCard.read(args.model)
-    args.out.parent.mkdir(parents=True, exist_ok=True)  # before minutes of work
+    make_places(args.out)  # before minutes of work
     of_objects = card.view.kind == "objects"
     how = {"seven_bits": not args.eight_bits, "n_threads": args.threads}
     if card.view.kind == "camera":
@@ -465,7 +465,8 @@ def _add_make(command: Command) -> None:
     add("out", "folder for scans, checkpoints and models; finished ones in it are kept", type=Path)
     _add_shared(add, "--kitti KITTI", "--layouts LAYOUTS", "--semantickitti SEMANTICKITTI")
     _add_shared(add, "--camvid CAMVID", "--fold FOLD", "--scans FOLDER[:LAYOUT]")
-    add("--steps STEPS", "training steps (default: as many as for the shipped model)", type=positive)
+    steps = "training steps of this model alone (default: as many as for the shipped one, as those made first have)"
+    add("--steps STEPS", steps, type=positive)
     _add_shared(add, "--threads THREADS", "--workers WORKERS", "--compile", "--model-version MODEL_VERSION")
 
 

@@ -77,7 +77,9 @@ def make(
         # The models that this one starts from or is distilled from must not be trained on the fold either.
         own_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
         base = out / f"{other}{_suffix(own_fold)}"
-        if not base.with_suffix(".onnx").exists():
+        # The figures are written last; those of objects need KITTI.
+        last = ".onnx" if MODELS[other].recipe.task == "objects" and data.kitti is None else ".json"
+        if not base.with_suffix(last).exists():
             make(other, out, replace(data, fold=own_fold), run, layouts=layouts, version=version)
         return base / "checkpoint.pt"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
+from edgeperc.errors import ModelFileError
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.types.card import ModelCard
 from edgeperc.types.choices import SPARSE_MODELS as SPARSE
@@ -67,6 +68,8 @@ def models_page(folder: Path) -> str:
         sorted((variant for path in sorted(of.glob("*.onnx")) for variant in resolve(path)), key=str)
         for of in (folder, folder / "research")
     )
+    if not shipped + research:
+        raise ModelFileError(f"{folder} is not a folder with .onnx models; expected one that holds some")
     is_own = not {*DEFAULT} <= {variant.name for variant in shipped}
     lines = ["# Models", "", *_prose(WRITTEN), *([] if is_own else ["", *_prose(SHIPPED)])]
     lines += [*_table(shipped), *_precisions(shipped), *_open(shipped)]
@@ -214,11 +217,13 @@ def _model(variant: Variant) -> Iterable[str]:
             f"{quantized['weight_bits']} bits, {len(quantized['left_alone'])} convolutions in fp32"
         )
     else:
-        yield f"- Trained on {training.get('data', 'unknown data')}: {_recipe(training.get('recipe', {}))}"
+        recipe = _recipe(training.get("recipe", {}))
+        yield f"- Trained on {training.get('data', 'unknown data')}" + f": {recipe}" * bool(recipe)
         for before in training.get("started_from", []):
             yield f"- Started from: {_recipe(before)}"
     yield f"- Terms of the weights: {training.get('licence', 'unknown')}"
-    yield f"- Parity with {'fp32' if 'quantized' in training else 'torch'}: {_flat(card.parity)}"
+    if card.parity:
+        yield f"- Parity with {'fp32' if 'quantized' in training else 'torch'}: {_flat(card.parity)}"
 
 
 def _recipe(recipe: Mapping[str, Any]) -> str:

@@ -73,8 +73,8 @@ def ablate(
     network: str, out: Path, data: Data, run: Run, *, steps: int, variants: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Run variants (by default all, and `PAPERS`), each of ``steps`` for the shipped batch size, from the network's
-    ``-sim`` model, and add their figures to ``out/ablation.json``; those in it are not run again. Returns those of this
-    fold and number of steps. Raises ValueError.
+    ``-sim`` model, and write their figures into ``out/ablation.json``; a finished run is not made again, and must be of
+    this data. Returns the figures of this fold and number of steps. Raises ValueError.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
@@ -85,8 +85,6 @@ def ablate(
     if unknown := [variant for variant in variants if variant not in known]:
         raise ValueError(f"{network} has no variant {unknown[0]!r}; expected one of: {'; '.join(known)}")
     for variant in variants or known:
-        if any({**of_run, "variant": variant}.items() <= row.items() for row in rows):
-            continue
         changes = dict(VARIANTS[network].get(variant, {}))
         teacher = run.start_from if changes.pop("teacher", False) else None
         n_scans = steps * shipped.batch * changes.pop("scans", 1.0)
@@ -100,7 +98,8 @@ def ablate(
         last = whole_lines(folder / "log.jsonl")[-1]
         if "validation" not in last:
             raise ValueError(f"{data.kitti} has no scan of fold {data.fold} to evaluate on; give another --fold")
-        rows.append({**of_run, "variant": variant, "scans": recipe.steps * recipe.batch, "figures": last["validation"]})
+        row = {**of_run, "variant": variant, "scans": recipe.steps * recipe.batch, "figures": last["validation"]}
+        rows = [*(each for each in rows if not {**of_run, "variant": variant}.items() <= each.items()), row]
         write_atomic(path, (json.dumps(rows, indent=1) + "\n").encode())
     return [row for row in rows if of_run.items() <= row.items()]
 

@@ -719,11 +719,16 @@ def test_each_variant_of_an_ablation_changes_its_setting(
     monkeypatch.setattr(ablation, "PAPER", PAPER | {"pointseg": replace(PAPER["pointseg"], batch=4)})
     start = untrained("pointseg", tmp_path)
     arguments = {"kitti": kitti, "simulated": simulated, "start_from": start, "fold": 1, "steps": 1, "n_threads": 1}
+    one_scan = tmp_path / "one"
+    one_scan.mkdir()
+    shutil.copy(min(simulated.iterdir()), one_scan)
     asked = ["nothing pasted", PAPERS]
     rows = ablate("pointseg", tmp_path / "out", **arguments, variants=asked)
     assert [row["variant"] for row in rows] == asked
     (tmp_path / "out/ablation.json").write_text(json.dumps([*rows, rows[0] | {"fold": 2}]))
     assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
+    with pytest.raises(ValueError, match="is of a run on other data"):
+        ablate("pointseg", tmp_path / "out", **{**arguments, "simulated": one_scan}, variants=asked)
     assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
     asked = ["as shipped", "scans times 2", "batches of 2"]
     rows = ablate("lodnn", tmp_path / "lodnn", **{**arguments, "start_from": None}, variants=asked)
@@ -781,11 +786,14 @@ def test_make_also_makes_the_models_that_it_starts_from(
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
     taught = make("pointseg", out, fold=0, **arguments)
     assert len(evaluated) == 3  # the teacher of this fold was made already
+    (out / "pointseg-sim.json").unlink()  # as if it had been stopped before its figures
+    make("pointseg-full", out, fold=0, steps=1, **arguments)
+    assert len(evaluated) == 5
     assert taught.stat().st_size < 0.6 * made.stat().st_size
     # An open one reads KITTI for its figures alone.
     training = Session(make("sceneseg", out, **arguments), "cpu").card.training
     assert (training["frames"], training["licence"], training["started_from"]) == ({}, "Apache-2.0", [])
-    assert len(evaluated) == 4
+    assert len(evaluated) == 6
     with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
         make("pointseg", out, kitti=None, layouts=None)
 
@@ -1169,7 +1177,10 @@ def test_a_page_of_own_models_says_nothing_of_the_shipped_ones(tmp_path: Path) -
     for card in (own, pillars.card_of("anchors")):
         entry = {"key": CARD_KEY, "value": card.to_json()}
         onnx.save(onnx.ModelProto(metadata_props=[entry]), tmp_path / f"{card.name}.onnx")
+    with pytest.raises(ModelFileError, match="is not a folder with"):
+        models_page(tmp_path / "none")
     page = models_page(tmp_path)
+    assert not [line for line in page.splitlines() if line.endswith(": ")]
     expected = "| points, 2 scans of mine |", "by `edgeperc eval MINE --json f.json`\n", "64 x 64 cells of 0.4 m"
     assert [words in page for words in expected] == [True] * 3
     assert not [words for words in ("drive_0011", "Research", "Precision", "NAME:int8") if words in page]

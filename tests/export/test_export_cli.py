@@ -143,6 +143,8 @@ def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, shell: Shell) -> No
     with pytest.raises(ValueError, match="network is 'yolo'; expected camseg, fcn16, fcn8, kulseg, lodnn, objects"):
         build(Recipe("yolo"))
     assert "no.pt" in shell.err("verify", tmp_path / "no.pt", tmp_path / "no.onnx")
+    for command in (["quantize", "pointseg"], ["export", tmp_path / "no.pt"]):  # before minutes of work
+        assert f"{tmp_path} is a folder; expected the name of a file" in shell.err(*command, tmp_path)
     arguments = {"kitti": tmp_path, "simulated": tmp_path, "start_from": None, "fold": 0, "steps": 1}
     with pytest.raises(ValueError, match="pointseg has no variant 'half'; expected one of: as shipped; nothing pasted"):
         ablate("pointseg", tmp_path, **arguments, variants=["half"])
