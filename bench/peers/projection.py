@@ -22,9 +22,15 @@ from edgeperc.inference.projection import (
 )
 from edgeperc.types.card import InputSpec
 from edgeperc.types.points import Floats32, Heights, Ints, Points
+from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
-from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 
+TOP_VIEW = TopViewGeometry()
+RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
+TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
+RANGE_IMAGE_INPUT = InputSpec(
+    "range_image", ("x", "y", "z", "remission", "range"), (13.0, 0.0, -1.3, 0.23, 14.5), (11.4, 7.9, 0.8, 0.15, 12.3)
+)
 Selection = tuple[NDArray[np.intp], Ints, Floats32]
 
 
@@ -136,7 +142,7 @@ def contenders(points: Points) -> dict[str, Callable[[], object]]:
     ):
         results = []
         for title, made in ((name, of_kernels), (f"{name}, numpy", by_numpy)):
-            projector: Any = made(view, input)
+            projector: Any = made(view, input)  # type: ignore[arg-type]
             image, index = np.empty(projector.shape, np.float32), np.empty(projector.shape[1:], np.int32)
             results.append((image, index, np.empty(len(points), np.int32)))
             calls[title] = partial(projector.fill, points, *results[-1])
