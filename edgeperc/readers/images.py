@@ -49,9 +49,9 @@ def read_image(path: str | os.PathLike[str]) -> Bytes:
     MissingExtraError
         Pillow is not installed.
     """
+    path = _FIELDS.path("the image", path)
     pillow = require("PIL.Image", "camera", "Reading an image", package="pillow")
     turned = require("PIL.ImageOps", "camera", "Reading an image", package="pillow").exif_transpose
-    path = _FIELDS.path("the image", path)
     try:
         if not path.is_file():
             raise ImageError(missing(path, "file", "an image as .jpg, .png, .webp, .bmp or .ppm"))
