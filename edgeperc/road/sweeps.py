@@ -190,7 +190,9 @@ class Sweeps:
 
 
 class SweepPerceiver:
-    """Perceives each scan with those before it, and tracks its boxes; for `edgeperc.stream`::
+    """Perceives each scan with those before it, and tracks its boxes.
+
+    Both are made to be called by `edgeperc.stream`::
 
         perceive = SweepPerceiver(Perceiver(sensor="vlp-16"), Tracker(), Odometry())
         with stream("udp:2368", perceive, perceive.track) as live:
