@@ -122,7 +122,12 @@ def pose_between(first: tuple[Floats, Floats], second: tuple[Floats, Floats], sh
     """
     (place, turn), (later_place, later_turn) = first, second
     near = later_turn if turn @ later_turn >= 0.0 else -later_turn
-    turned = (1.0 - share) * turn + share * near
+    # The turn goes on at one rate (slerp): a straight line of quaternions falls short of it above a share of 1.
+    angle = 2.0 * math.asin(min(float(np.linalg.norm(near - turn)) / 2.0, 1.0))
+    rest, gone = 1.0 - share, share
+    if angle > 1e-6:
+        rest, gone = math.sin(rest * angle) / math.sin(angle), math.sin(gone * angle) / math.sin(angle)
+    turned = rest * turn + gone * near
     (pose,) = poses_of(((1.0 - share) * place + share * later_place)[None], (turned / np.linalg.norm(turned))[None])
     return np.asarray(pose, np.float64)
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -78,13 +78,14 @@ def test_the_first_shift_is_that_of_what_stands(x: int, y: int, is_hanging: bool
         np.testing.assert_array_equal(first_shift(nothing, now), [0.0, 0.0])
 
 
-@given(st.floats(-3.0, 3.0), st.floats(-0.5, 0.5), st.floats(0.0, 2.0))
+@given(st.floats(-3.0, 3.0), st.floats(-2.0, 2.0), st.floats(0.0, 20.0))
+@example(0.0, 0.5, 2.0)
 def test_a_share_of_a_motion_is_that_of_its_turn_and_way(x: float, turn: float, share: float) -> None:
     def motion(x: float, turn: float) -> NDArray[np.float64]:
         cos, sin = math.cos(turn), math.sin(turn)
         return np.array([[cos, -sin, 0, x], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
 
-    np.testing.assert_allclose(part_of(motion(x, turn), share), motion(share * x, share * turn), atol=0.01)
+    np.testing.assert_allclose(part_of(motion(x, turn), share), motion(share * x, share * turn), atol=1e-9)
 
 
 def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
