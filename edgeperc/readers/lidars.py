@@ -20,6 +20,7 @@ from .packets import Datagrams
 from .ports import is_port, named
 from .senders import Lidar, not_decoded
 from .spinning_packets import (
+    ALIKE,
     FORMATS,
     Angles,
     Format,
@@ -29,12 +30,12 @@ from .spinning_packets import (
     has_16_lasers,
     name_of,
     read_angles,
+    told_apart,
 )
 from .times import TimedScan
 from .units import hesai_calibration
 
 _STEPS = 200  # packets that show how far apart columns are
-_ALIKE = {"helios-32", "helios-16"}  # by their packets; the angles tell them apart
 Opened = tuple[SpinningStream | MemsStream | MirrorStream, Callable[[memoryview], bool]]
 
 
@@ -53,17 +54,20 @@ def open_spinning(
         if said is not None:
             break
     if file is not None and (said is None or row.elevations_deg):
-        return row, read_angles(file, row)
+        angles = read_angles(file, row)
+        return told_apart(row, angles), angles
     if said is None and row.is_hesai and unit is not None:
         with _asked(f"the angles of the lasers of this {row.title} are not known", path, ".csv"):
-            return row, read_angles(hesai_calibration(unit), row)
+            angles = read_angles(hesai_calibration(unit), row)
+            return told_apart(row, angles), angles
     if said is None:
         there = "" if row.is_hesai else "There is no packet with the angles (DIFOP, port 7788). "
         if there and is_port(path):
             there += f"Listen to its port, too: {path},7788. Or: "
+        titles = " or ".join(FORMATS[name].title for name in (row.name, ALIKE.get(row.name)) if name)
         whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"
         raise PointsError(
-            f"the angles of the lasers of this {row.title} are not known. {there}Put {whose} beside it, as "
+            f"the angles of the lasers of this {titles} are not known. {there}Put {whose} beside it, as "
             f"{named(path).stem}.csv"
         )
     return row, said
@@ -152,7 +156,7 @@ def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview
 def is_of(row: Format, payload: memoryview) -> bool:
     """Whether it is a packet of this format."""
     found = format_of(payload)
-    return found is not None and (found == row or {found.name, row.name} == _ALIKE)
+    return found is not None and (found == row or row.name == ALIKE.get(found.name))
 
 
 def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryview | None) -> dict[str, Any]:

@@ -23,9 +23,11 @@ from .units import Told
 
 
 class Clock(NamedTuple):
-    """Where a packet has its time: the date, or the seconds; Hesai's the microseconds and the speed, too."""
+    """Where a packet has its time: the date, or the seconds; Hesai's the microseconds and the speed, too. The rest of
+    the seconds is in microseconds unless the kind says otherwise.
+    """
 
-    kind: Literal["hesai", "date", "seconds"]
+    kind: Literal["hesai", "date", "seconds", "nanoseconds"]
     at: int
     micros_at: int = 0
     speed_at: int = 0
@@ -53,6 +55,7 @@ class Format(NamedTuple):
     mask: int = 0xFFFF
     mm_at: int = 0  # the byte of a packet that says how many mm the unit is; 0: none does
     lens_m: tuple[float, float] = (0.0, 0.0)  # distance of the lasers from the axis, and height
+    rpm: float = 1.0  # of a Hesai's motor: the unit of its speed
     lasers: int = 0  # 16: channels beyond are a second firing or return; 96: every second block has those beyond 48
     elevations_deg: tuple[float, ...] = ()  # of every unit; empty: each unit has its own angles
     spins: bool = True  # or its mirrors do alone
@@ -96,6 +99,14 @@ def _xt(name: str, elevations: Sequence[float], fires_us: Iterable[float], n_blo
     )  # fmt: skip
 
 
+def _plus(name: str, series: str, n_blocks: int, fires_us: Iterable[float], size: int = 1248) -> Format:
+    fires = tuple(fires_us)
+    return Format(
+        name, f"RoboSense RS-Ruby Plus{series}", 80, n_blocks, len(fires), 3, (size,), b"\xfe", 4, fires,
+        Clock("seconds", 10), unit_m=0.005, lens_m=(0.03171, 0.0),
+    )  # fmt: skip
+
+
 _NO_FIRES = (0.0,) * 128
 _AT_NS = (0, 848, 2504, 4112, 4144, 4976, 6616, 8240, 8264, 9112, 10768, 12376, 12424, 13280, 14928)
 _AT_LASERS = (
@@ -103,8 +114,25 @@ _AT_LASERS = (
     "19d2512eaae56691dd95221aeea65963c0400c0834778bbc3400000c87487bb8"
 )
 _OLD, _DATE, _SECONDS = b"\xff\xee", Clock("date", 20), Clock("seconds", 20)
+# The first two of each eight channels, whose odd and even ones fire 3.04 us apart; of the last eight, of each half.
+_JT_FIRST_US = (
+    95.18, 23.24, 77.28, 92.14, 50.26, 11.08, 65.12, 105.82, 38.1, 24.76, 78.8, 93.66, 51.78, 12.6, 66.64, 103.54,
+    39.62, 22.48, 76.52, 91.38, 49.5, 10.32, 64.36, 105.06, 37.34, 24.0, 78.04, 92.9, 51.02, 11.84, 65.88, 38.86,
+)  # fmt: skip
+_JT_US = (
+    *(95.18 + 3.04 * (k // 2) if k % 2 == 0 else 23.24 - 3.04 * (k // 2) for k in range(8)),
+    *(_JT_FIRST_US[k // 8 * 2 + k % 2] - 3.04 * (k % 8 // 2) for k in range(8, 120)),
+    *(_JT_FIRST_US[30 + k // 4] - 3.04 * (k % 4) for k in range(8)),
+)
+# Of four channels each; how many channels of the 80 fire then.
+_PLUS_US = (
+    0.0, 1.217, 2.434, 3.652, 4.869, 6.086, 7.304, 8.521, 9.739, 11.323, 12.907, 14.924, 16.941, 18.959, 20.976, 23.127,
+    25.278, 27.428, 29.579, 31.963, 34.347, 36.498, 38.648, 40.666, 42.683, 44.267, 45.851, 47.435, 49.019, 50.603,
+    52.187, 53.771,
+)  # fmt: skip
+_PLUS_80 = "44232222222244444444442210000132"
 _RUBY = "000112222333444555666778899aabbccddeefff000111222334444556667778899aabbbccdeefff"  # firings of 80 channels
-# Of eight channels each.
+# Of eight channels each, of 96.
 _AIRY_US = (0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104)
 _FORMATS = (
     Format("pandar40p", "Hesai Pandar40P", 0, 10, 40, 3, (1262, 1266), _OLD, 4, _NO_FIRES[:40],
@@ -120,6 +148,9 @@ _FORMATS = (
     # Whether there are bytes of confidence and of functional safety is in the packet.
     Format("ot128", "Hesai OT128", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
            _tail(788, 15, 21, 13), reference=-1, mm_at=9),
+    # Its packets are an OT128's, but for the unit of the speed; the driver's file of firing times is of every unit.
+    Format("jt128", "Hesai JT128", 12, 2, 128, 3, (), b"", 2, _JT_US,
+           _tail(788, 15, 21, 13), reference=-1, late_us=-1888.0, mm_at=9, rpm=0.1),
     Format("qt128", "Hesai QT128C2X", 12, 2, 128, 3, (), b"", 2, _NO_FIRES,
            _tail(788, 15, 21, 13), reference=-1, late_us=9.0, mm_at=9),
     # Its `mirror_packets`; 4 bytes more for a number of the packet, 32 for a signature.
@@ -143,19 +174,33 @@ _FORMATS = (
            lens_m=(0.03806, 0.0), lasers=16),
     Format("rs-airy", "RoboSense Airy", 42, 8, 48, 3, (1248,), _OLD, 4, tuple(_AIRY_US[k // 8] for k in range(96)),
            _SECONDS, unit_m=0.005, mask=0x3FFF, lens_m=(0.01143, 0.06056), lasers=96),
+    Format("rs-airy-48", "RoboSense Airy of 48 lasers", 42, 8, 48, 3, (1248,), _OLD, 4,
+           tuple(_AIRY_US[k // 4] for k in range(48)), _SECONDS, unit_m=0.005, mask=0x3FFF, lens_m=(0.01143, 0.06056)),
     Format("rs-ruby-80", "RoboSense RS-Ruby Lite", 80, 4, 80, 3, (1248,), b"\xfe", 4,
            tuple(3.236 * int(firing, 16) for firing in _RUBY), Clock("seconds", 10),
            unit_m=0.005, lens_m=(0.03995, 0.0)),
     Format("rs-ruby-128", "RoboSense RS-Ruby", 80, 3, 128, 3, (1248,), b"\xfe", 4,
            tuple(3.236 * (k // 4 % 16) for k in range(128)), Clock("seconds", 10), unit_m=0.005, lens_m=(0.03995, 0.0)),
+    _plus("ruby-plus-128", "", 3, (_PLUS_US[k // 4] for k in range(128))),
+    _plus("ruby-plus-80", " 80", 4, (us for us, n in zip(_PLUS_US, _PLUS_80, strict=True) for _ in range(int(n)))),
+    _plus("ruby-plus-80v", " 80V", 4, (_PLUS_US[k // 4] for k in range(80))),
+    _plus("ruby-plus-48", " 48", 8, (_PLUS_US[k // 2] for k in range(48)), 1268),
 )  # fmt: skip
 FORMATS = {row.name: row for row in _FORMATS}
 """The formats that are decoded, by name."""
+
+# Models with the same packets, which the angles of the unit tell apart; each is taken for the first.
+ALIKE = {"ot128": "jt128", "helios-32": "helios-16"}
 
 _MSOP, _MSOP_NEW = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
 
 _OLD_MODELS = {1: "rs-16", 2: "rs-32", 3: "rs-bpearl"}
 _OTHER_MODELS = {4: "RS-Ruby", 5: "RS-Ruby Lite"}
+# The series of the Ruby Plus, and its models; later manuals name none.
+_PLUS = 5
+_PLUS_MODELS = {0: "ruby-plus-128", 1: "ruby-plus-128", 2: "ruby-plus-80", 3: "ruby-plus-80v", 4: "ruby-plus-48"}
+# By the kind of data, 0 for points, and the model.
+_AIRY_MODELS = {(0, 1): "rs-airy-48", (0, 2): "rs-airy"}
 # Of Hesai's later sensors: version of the packets, channels and blocks.
 _HESAI = {
     (6, 1, 32, 8): "pandarxt-32",
@@ -170,7 +215,7 @@ _HESAI_NAMES = {
     (4, 3): "AT128",
     (3, 2): "QT128",
     (6, 1): "XT",
-    (1, 8): "JT",
+    (1, 8): "JT16",
     (2, 5): "ET25",
     (4, 7): "ATX",
     (7, 2): "FT120",
@@ -178,6 +223,7 @@ _HESAI_NAMES = {
 
 # A turn of the fastest settings has a twentieth of it.
 _MOST_PACKETS = 20_000
+_UPWARD_DEG = 45.0
 _HALF_TURN_DEG, _SPEEDS = 180.0, (60.0, 3000.0)
 
 
@@ -195,11 +241,13 @@ def format_of(payload: memoryview) -> Format | None:
     elif head[:8] == _MSOP and size > 32:
         is_new = bytes(payload[31:33]) == b"\x03\x04"
         row = FORMATS.get("rs-bpearl-4" if is_new else _OLD_MODELS.get(payload[30], ""))
-    elif head[:4] == _MSOP_NEW and size == 1248:
-        named = (FORMATS[name] for name in ("helios-32", "rs-airy", "rs-ruby-128", "rs-ruby-80"))
+    elif head[:4] == _MSOP_NEW and size in (1248, 1268):
+        named = (FORMATS[name] for name in ("helios-32", "rs-airy", "rs-ruby-128", "rs-ruby-80", "ruby-plus-48"))
         row = next((each for each in named if _has_flags(payload, each)), None)
-        if row is not None and ((row.header == 80 and payload[31] == 5) or (row.lasers == 96 and payload[32] != 2)):
-            row = None
+        if row is not None and row.header == 80 and (row.name == "ruby-plus-48" or payload[31] == _PLUS):
+            row = FORMATS.get(_PLUS_MODELS.get(payload[32], "") if payload[31] == _PLUS else "")
+        elif row is not None and row.lasers == 96:
+            row = FORMATS.get(_AIRY_MODELS.get((payload[16], payload[32]), ""))
     return row if row is not None and size in row.sizes and _has_flags(payload, row) else None
 
 
@@ -210,10 +258,7 @@ def name_of(payload: memoryview) -> str | None:
         return row.title
     if head[:8] == _MSOP and len(payload) > 30:
         return f"RoboSense {_OTHER_MODELS.get(payload[30], 'sensor')}"
-    if head[:4] == _MSOP_NEW and len(payload) > 32:
-        is_plus = len(payload) == 1248 and _has_flags(payload, FORMATS["rs-ruby-128"]) and payload[31] == 5
-        return "RoboSense RS-Ruby Plus" if is_plus else "RoboSense sensor"
-    if head[:3] == b"\xaa\x55\x05":
+    if head[:4] == _MSOP_NEW or head[:3] == b"\xaa\x55\x05":
         return "RoboSense sensor"
     if head[:2] != b"\xee\xff" or len(payload) < 12:
         return None
@@ -251,7 +296,7 @@ def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
         is_set = not np.isin(content[1165:1169], (0, 255)).all()
     else:
         n = row.lasers or row.n_channels
-        per_list = 128 if row.header == 80 else max(n, 32)
+        per_list = 128 if row.header == 80 else 32 if n <= 32 else 96
         triples = content[468 : 468 + 6 * per_list].reshape(2, per_list, 3)[:, :n].astype(np.float64)
         lasers = (0.01 * (triples[..., 1:] @ [256.0, 1.0]) * np.where(triples[..., 0] > 0, -1.0, 1.0)).T
         is_set = not (triples[0, :, 0] == 255).any() and len(np.unique(lasers[:, 0])) == n
@@ -260,6 +305,13 @@ def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
     return Angles(
         np.round(lasers, 4).astype(np.float64), float(int.from_bytes(payload[8:10], "big")), payload[300] == 0
     )
+
+
+def told_apart(row: Format, angles: Angles) -> Format:
+    """An OT128, or the JT128 that has the same packets and looks up."""
+    if row.name != "ot128" or angles.lasers_deg[:, 0].max() < _UPWARD_DEG:
+        return row
+    return FORMATS["jt128"]._replace(channel_bytes=row.channel_bytes, clock=row.clock, sizes=row.sizes)
 
 
 def has_16_lasers(payload: memoryview) -> bool:
@@ -386,9 +438,12 @@ class SpinningStream:
 
     def _packet(self, payload: memoryview) -> _Packet:
         row = self._row
+        # A Ruby counts microseconds by its manual, and nanoseconds by its maker's driver.
+        if row.header == 80 and int.from_bytes(payload[row.clock.at + 6 : row.clock.at + 10], "big") >= 10**6:
+            row = self._row = row._replace(clock=Clock("nanoseconds", row.clock.at))
         azimuths = np.array(self.azimuths_of(payload))
         speed_at = row.clock.speed_at
-        rpm = float(struct.unpack_from("<H", payload, speed_at)[0]) if speed_at else self._angles.rpm
+        rpm = row.rpm * struct.unpack_from("<H", payload, speed_at)[0] if speed_at else self._angles.rpm
         is_likely = _SPEEDS[0] <= rpm <= _SPEEDS[1]
         return _Packet(bytes(payload), time_of(row, payload), rpm if is_likely else 600.0, azimuths)
 
@@ -449,9 +504,9 @@ def _beams(row: Format, angles: Angles, is_dual: bool) -> Floats:
 def time_of(row: Format, payload: memoryview) -> float:
     """The time that a packet states [s]."""
     kind, at, micros_at, _ = row.clock
-    if kind == "seconds":
-        high, low, micros = struct.unpack_from(">HII", payload, at)
-        return float((high << 32 | low) + 1e-6 * micros)
+    if kind in ("seconds", "nanoseconds"):
+        high, low, rest = struct.unpack_from(">HII", payload, at)
+        return float((high << 32 | low) + (1e-6 if kind == "seconds" else 1e-9) * rest)
     date = bytes(payload[at : at + 6])
     if kind == "hesai":
         micros = int.from_bytes(payload[micros_at : micros_at + 4], "little")

@@ -49,6 +49,7 @@ MODELS = {
         Model("qt128", 128, 2, 128, 0.004, 0.4, layout="<"),
         Model("pandarqt-64", 64, 4, 64, 0.004, 0.6, layout="<"),
         Model("ot128", 128, 2, 128, 0.004, 0.2, layout="<"),
+        Model("jt128", 128, 2, 128, 0.004, 0.4, layout="<"),
         Model("rs-16", 16, 12, 32, 0.005, 0.4, second="firing"),
         Model("rs-32", 32, 12, 32, 0.005),
         Model("rs-bpearl", 32, 12, 32, 0.005),
@@ -56,8 +57,13 @@ MODELS = {
         Model("helios-32", 32, 12, 32, 0.0025),
         Model("helios-16", 16, 12, 32, 0.0025, 0.4, second="firing"),
         Model("rs-airy", 96, 8, 48, 0.005, 0.4, second="lasers"),
+        Model("rs-airy-48", 48, 8, 48, 0.005, 0.4),
         Model("rs-ruby-80", 80, 4, 80, 0.005),
         Model("rs-ruby-128", 128, 3, 128, 0.005),
+        Model("ruby-plus-128", 128, 3, 128, 0.005),
+        Model("ruby-plus-80", 80, 4, 80, 0.005),
+        Model("ruby-plus-80v", 80, 4, 80, 0.005),
+        Model("ruby-plus-48", 48, 8, 48, 0.005),
     )
 }
 DATE = bytes((25, 6, 15, 15, 6, 40))  # T0_S
@@ -70,7 +76,8 @@ def unit_angles(model: Model, seed: int = 5) -> NDArray[np.float64]:
         return np.round(np.stack([19.5 - 1.3 * np.arange(32), np.zeros(32)], 1), 1)
     if model.name.startswith("pandarxt"):
         return np.stack([np.linspace(15, -16 if model.lasers == 32 else -15, model.lasers), np.zeros(model.lasers)], 1)
-    top, bottom = (89.0, 0.5) if model.name in ("rs-airy", "rs-bpearl", "rs-bpearl-4") else (15.0, -25.0)
+    upward = ("rs-airy", "rs-airy-48", "rs-bpearl", "rs-bpearl-4", "jt128")
+    top, bottom = (89.0, 0.5) if model.name in upward else (15.0, -25.0)
     elevation = np.linspace(top, bottom, model.lasers) + rng.uniform(-0.02, 0.02, model.lasers)
     if model.name == "rs-16":  # whose first eight are below
         return np.stack([np.concatenate([-np.arange(15.0, -1.0, -2.0), np.arange(15.0, -1.0, -2.0)]), np.zeros(16)], 1)
@@ -86,7 +93,7 @@ def ranges(model: Model, n_columns: int, seed: int = 1) -> tuple[NDArray[np.int6
     meters = meters[np.isfinite(meters) & (meters > 0.5)]
     units = np.round(rng.choice(meters, (n_columns, model.lasers)) / model.unit_m).astype(np.int64)
     units[rng.random(units.shape) < 0.3] = 0
-    return np.minimum(units, 0x3FFF if model.name == "rs-airy" else 0xFFFF), rng.integers(0, 256, units.shape)
+    return np.minimum(units, 0x3FFF if "airy" in model.name else 0xFFFF), rng.integers(0, 256, units.shape)
 
 
 def blocks_of(
@@ -117,7 +124,7 @@ def packets_of(
 
 def _packet(model: Model, blocks: Sequence[tuple[int, Any, Any]], rpm: int, micros: int) -> bytes:
     name = model.name
-    wide = name.startswith(("pandarxt", "pandarqt", "ot128", "qt128"))
+    wide = name.startswith(("pandarxt", "pandarqt", "ot128", "jt128", "qt128"))
     flag = b"\xff\xee" if name == "pandar40p" or (model.layout == ">" and "ruby" not in name) else b""
     flag = b"\xfe\x00" if "ruby" in name else flag
     body = b""
@@ -135,26 +142,31 @@ def _packet(model: Model, blocks: Sequence[tuple[int, Any, Any]], rpm: int, micr
         head = old + date + bytes([{"rs-16": 1, "rs-32": 2, "rs-bpearl": 3}[name]]) + bytes(11)
     elif name == "rs-bpearl-4":
         head = old + utc + b"\x03\x03\x04" + bytes(9)
-    elif name == "rs-airy":
-        head = bytes.fromhex("55aa055a") + bytes(16) + utc + b"\0\x09\x02" + bytes(9)
+    elif "airy" in name:
+        head = bytes.fromhex("55aa055a") + bytes(16) + utc + bytes([0, 9, 1 if name == "rs-airy-48" else 2]) + bytes(9)
     elif name.startswith("helios"):
         head = bytes.fromhex("55aa055a") + bytes(16) + utc + bytes(12)
+    elif name.startswith("ruby-plus"):
+        utc = seconds.to_bytes(6, "big") + (1000 * micros).to_bytes(4, "big")
+        number = 1 + ["ruby-plus-128", "ruby-plus-80", "ruby-plus-80v", "ruby-plus-48"].index(name)
+        head = bytes.fromhex("55aa055a") + bytes(6) + utc + bytes(11) + bytes([5, number]) + bytes(47)
     else:
         head = bytes.fromhex("55aa055a") + bytes(6) + utc + bytes(60)
-    return (head + body).ljust(1248, b"\0")
+    return (head + body).ljust(1268 if name == "ruby-plus-48" else 1248, b"\0")
 
 
 def _hesai_packet(model: Model, body: bytes, rpm: int, micros: int) -> bytes:
     date = bytes([DATE[0], *DATE[1:5], DATE[5] + micros // 10**6])
     micros %= 10**6
-    speed, stamp = struct.pack("<H", rpm), struct.pack("<I", micros)
+    speed, stamp = struct.pack("<H", 10 * rpm if model.name == "jt128" else rpm), struct.pack("<I", micros)
     if model.name in ("pandar40p", "pandar64"):
         head = b"" if model.name == "pandar40p" else bytes((0xEE, 0xFF, 64, 6, 0, 4, 1, 0))
         return head + body + bytes(8) + speed + stamp + b"\x37\x42" + date
-    version = {"pandarxt": (6, 1), "pandarqt": (3, 1), "ot128": (1, 4), "qt128": (3, 2)}[model.name.partition("-")[0]]
-    options = 0x15 if model.name in ("ot128", "qt128") else 1  # confidence, functional safety, numbered
+    versions = {"pandarxt": (6, 1), "pandarqt": (3, 1), "ot128": (1, 4), "jt128": (1, 4), "qt128": (3, 2)}
+    version = versions[model.name.partition("-")[0]]
+    options = 0x15 if model.lasers == 128 else 1  # confidence, functional safety, numbered
     head = bytes((0xEE, 0xFF, *version, 0, 0, model.lasers, model.blocks, 0, 4, 1, options))
-    if model.name in ("ot128", "qt128"):
+    if model.lasers == 128:
         tail = bytes(4 + 17 + 12) + b"\x37" + speed + date + stamp + b"\x42" + bytes(4 + 4)
     elif model.name.startswith("pandarxt"):
         tail = bytes(10) + b"\x37" + speed + date + stamp + b"\x42" + bytes(4)
@@ -170,7 +182,7 @@ def difop(model: Model, angles: NDArray[np.float64], rpm: int = 600, is_dual: bo
     if model.name == "rs-16":
         content[1165:1213] = b"".join(round(abs(10_000 * e)).to_bytes(3, "big") for e in angles[:, 0].tolist())
         return bytes(content)
-    per_list = {"rs-ruby-80": 128, "rs-ruby-128": 128, "rs-airy": 96}.get(model.name, 32)
+    per_list = 128 if "ruby" in model.name else 96 if "airy" in model.name else 32
     for column, at in ((0, 468), (1, 468 + 3 * per_list)):
         written = [bytes([v < 0]) + round(abs(100 * v)).to_bytes(2, "big") for v in angles[:, column].tolist()]
         content[at : at + 3 * per_list] = b"".join(written).ljust(3 * per_list, b"\xff" if column == 0 else b"\0")
