@@ -30,7 +30,7 @@ SCANS ?= 20000
 # Of make test-extra.
 EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-interpreted test-bounds test-wheel test-minimal test-lowest test-ahead test-newest test-extra test-arm docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-interpreted test-bounds test-wheel test-minimal test-lowest test-ahead test-newest test-extra test-arm docs fuzz search soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -47,6 +47,7 @@ help:
 	@echo "make test-arm      edgeperc on aarch64 under qemu, compared with x86; skipped without qemu"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
 	@echo "make fuzz          hostile scans, captures, models, boxes, commands, images; SECONDS=300 SEED=7 KINDS='scans models'"
+	@echo "make search        the property tests with a thousand other examples each"
 	@echo "make soak          whether memory grows over SCANS=20000 scans with stream, tracker and pictures"
 	@echo "make release       the packages, their SBOM and SHA256SUMS in dist/; make sbom does the same"
 	@echo "make clean         remove the environments and whatever else is made here"
@@ -134,6 +135,9 @@ test-arm: .venv-test/installed
 
 fuzz: .venv-test/installed
 	$(TEST)/python -m tests.fuzz $(KINDS) --jobs $(JOBS) --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
+
+search: .venv-test/installed
+	$(TEST)/pytest -q -m hypothesis --hypothesis-profile search -n $(JOBS) --dist worksteal
 
 soak: .venv-test/installed
 	$(TEST)/edgeperc-bench soak --application --scans $(SCANS)
