@@ -574,8 +574,8 @@ def _few_rows(scan: Measures, profile: FitnessProfile, sensor: SensorProfile, ha
         return None
     return Finding(
         f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
-        f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
-        "model trained for it.",
+        f"training it had at least {profile.beams[0]:.0f}: alone, it shows little of far and small objects; several "
+        "scans together show more (--track --sweeps 10, SweepPerceiver).",
         too_few_rows and sensor.pattern is None,  # which has no rows
     )
 
