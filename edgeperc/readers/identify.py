@@ -25,15 +25,15 @@ _OUSTER_SPANS = {"os2": (18.0, 27.0), "os1": (30.0, 48.0), "os0": (75.0, 100.0)}
 
 # Words in the topic or frame of a point cloud.
 _MAKERS = {
-    "velodyne": r"velodyne|vlp|hdl|puck",
+    "velodyne": r"velodyne|vlp|vls|hdl|puck",
     "ouster": r"ouster|os_?(sensor|lidar|cloud)|(?<![a-z])os[012]",
     "hesai": r"hesai|pandar",
 }
 # First letters of the profiles of each maker.
-_PREFIXES = {"velodyne": ("hdl", "vlp"), "ouster": ("os",), "hesai": ("pandar", "at")}
+_PREFIXES = {"velodyne": ("hdl", "vl"), "ouster": ("os",), "hesai": ("pandar", "at")}
 
 # Between the median elevation of the rings of a scan and those of the profile of their sensor [deg]. Units differ by up
-# to 1.4 from the profile, models with the same number of beams by 3 and more.
+# to 1.4 from the profile, models with the same number of beams by 2.6 and more.
 _RING_ERROR_DEG = 1.0
 
 

@@ -39,15 +39,15 @@ DIFOP = bytes.fromhex("a5ff005a11115555")
 """The first bytes of what RoboSense's sensors say of themselves."""
 _FLAG = b"\xff\xee"  # 0xEEFF, with which the first of twelve blocks begins
 
-# The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
+# The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. The first VLS-128 had others.
 _PRODUCTS = {
     0x21: "hdl-32e",
     0x22: "vlp-16",
     0x23: "VLP-32A or VLP-32B",
-    0x24: "Puck Hi-Res",
+    0x24: "vlp-16-hi-res",
     0x28: "vlp-32c",
     0x63: "VLS-128",
-    0xA1: "VLS-128",
+    0xA1: "vls-128",
 }
 _RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
 
@@ -235,7 +235,7 @@ def velodyne_name(packet: memoryview) -> str | None:
     """The model of a Velodyne, None if the packet does not name it."""
     blocks = {bytes(packet[k : k + 2]) for k in range(0, 1200, 100)}
     if blocks & {b"\xff\xcc", b"\xff\xbb"}:
-        return "VLS-128"
+        return _PRODUCTS[0xA1 if packet[-1] == 0xA1 else 0x63]
     if b"\xff\xdd" in blocks:  # the second half of the lasers; the last bytes hold its status instead
         return "hdl-64e"
     return _PRODUCTS.get(packet[-1]) if packet[-2] in _RETURN_MODES else None

@@ -394,6 +394,12 @@ _VLP_32C = (
     *(-2.33, -2.67, -3.0, -3.33, -3.67, -4.0, -4.67, -5.33, -6.15, -7.25, -8.84, -11.31, -15.64, -25.0),
 )
 
+_VLS_128 = (
+    *(15.0, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98, 4.83),
+    *(round(4.72 - 0.11 * k, 2) for k in range(103)),
+    *(-6.65, -6.85, -7.15, -7.65, -8.352, -9.244, -10.346, -11.742, -13.565, -16.042, -19.582, -25.0),
+)
+
 # Design angles of the Pandar64, which its drivers use for units without a calibration file.
 _PANDAR_64 = (
     *(14.88, 11.03, 8.06, 5.06, 3.04, 2.03, 1.86, 1.69, 1.52, 1.35, 1.18, 1.01, 0.85, 0.68, 0.51, 0.34, 0.17, 0.0),
@@ -469,7 +475,18 @@ _BUILT_IN = (
     SensorProfile.uniform(
         "vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0, remission=_OF_VELODYNE
     ),
+    SensorProfile.uniform(
+        "vlp-16-hi-res",
+        16,
+        10.0,
+        -10.0,
+        remission_range=_BYTE,
+        min_range_m=0.5,
+        max_range_m=105.0,
+        remission=_OF_VELODYNE,
+    ),
     SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, min_range_m=1.0, max_range_m=200.0, remission=_OF_VELODYNE),
+    SensorProfile("vls-128", _VLS_128, 1800, _BYTE, min_range_m=0.5, max_range_m=245.0, remission=_OF_VELODYNE),
     *_ouster("os0", 45.0, 0.3, 75.0),
     *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
     *_ouster("os2", 11.25, 0.8, 350.0),

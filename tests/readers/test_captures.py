@@ -385,6 +385,30 @@ def test_an_hdl_64e_is_calibrated_and_scaled_as_kitti_is(tmp_path: Path) -> None
         assert f"exact model and calibration could not be determined: {why}" in error_of(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "product", "flags"),
+    [("vls-128", 0xA1, b"\xee\xdd\xcc\xbb"), ("vlp-16-hi-res", 0x24, b"\xee"), ("vlp-32c", 0x28, b"\xee")],
+)
+def test_a_velodyne_has_the_beams_of_its_profile(tmp_path: Path, name: str, product: int, flags: bytes) -> None:
+    pytest.importorskip("velodyne_decoder")
+    blocks = [bytes([0xFF, flags[k % len(flags)]]) for k in range(12)]
+    packets = [
+        b"".join(
+            flag + struct.pack("<H", (12 * n + k) // len(flags) * 20 % 36000) + struct.pack("<HB", 30_000, 7) * 32
+            for k, flag in enumerate(blocks)
+        )
+        + struct.pack("<IBB", 1_000_000 + 200 * n, 0x37, product)
+        for n in range(60)
+    ]
+    path = write_pcap(tmp_path / "any.pcap", packets)
+    assert edgeperc.sensor_of(path).name == name
+    points = np.concatenate([points for _, points in read_scans(path)]).astype(np.float64)
+    seen = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    off_deg = np.abs(seen[:, None] - np.array(SENSORS[name].elevations_deg))
+    assert off_deg.min(axis=1).max() < 0.06
+    assert off_deg.min(axis=0).max() < 0.06
+
+
 @pytest.fixture(scope="module")
 def ouster(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with sphere.pcap, its metadata and sphere.osf: three turns of 64 x 512, every other column empty."""

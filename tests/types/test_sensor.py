@@ -18,6 +18,7 @@ def test_built_in_profiles() -> None:
     beams = {name: profile.n_beams for name, profile in SENSORS.items() if profile.pattern is None}
     assert beams == {
         **{"hdl-64e": 64, "hdl-32e": 32, "vlp-16": 16, "vlp-32c": 32, "pandar64": 64, "pandarxt-32": 32},
+        **{"vlp-16-hi-res": 16, "vls-128": 128},
         **{"at128": 128, "rs-m1": 125, "rs-e1": 144},
         **{f"{model}-{n}": n for model in ("os0", "os1", "os2") for n in (32, 64, 128)},
     }
