@@ -668,7 +668,9 @@ def _match(beams: Beams) -> Match:
                 fits = off_deg.max() <= _UNIT_OF_BLOCKS_DEG and np.median(off_deg) <= _MEDIAN_OF_BLOCKS_DEG
             if fits:
                 error_deg = round(float(off_deg.max()), 3)
-                is_whole = n >= _SEEN * len(known)
+                # Beams above them may meet nothing but the sky.
+                has_lowest = way > 0.0 and nearest.max() >= len(known) - 2
+                is_whole = n >= _SEEN * (len(known) - int(nearest.min()) * has_lowest)
                 found.append(Match(name, error_deg) if is_whole else Match(part_of=name, off_deg=error_deg))
     return min(found[1:] or found, key=lambda each: (not each.name, each.off_deg))
 

@@ -28,9 +28,15 @@ _MAKERS = {
     "velodyne": r"velodyne|vlp|vls|hdl|puck",
     "ouster": r"ouster|os_?(sensor|lidar|cloud)|(?<![a-z])os[012]",
     "hesai": r"hesai|pandar",
+    "robosense": r"rslidar|robosense",
 }
 # First letters of the profiles of each maker.
-_PREFIXES = {"velodyne": ("hdl", "vl"), "ouster": ("os",), "hesai": ("pandar", "at")}
+_PREFIXES = {
+    "velodyne": ("hdl", "vl"),
+    "ouster": ("os",),
+    "hesai": ("pandar", "at", "ot", "jt"),
+    "robosense": ("rs-", "helios", "ruby"),
+}
 
 # Between the median elevation of the rings of a scan and those of the profile of their sensor [deg]. Units differ by up
 # to 1.4 from the profile, models with the same number of beams by 2.6 and more.

@@ -113,6 +113,19 @@ def test_any_beams_are_found_or_it_cannot_be_told(
     assert found.n_beams <= len(elevations_deg)
 
 
+@pytest.mark.parametrize("name", ["os0-64", "jt128", "rs-bpearl"])
+def test_beams_to_the_sky_may_have_no_return(name: str) -> None:
+    """The others are as if they all were; beams in the middle alone may be of another sensor."""
+    scan = spinning(np.array(SENSORS[name].elevations_deg))
+    elevation = np.degrees(np.arctan2(scan[:, 2], np.hypot(scan[:, 0], scan[:, 1])))
+    found = estimate_sensor([scan[elevation < SENSORS[name].fov_down_deg + 35.0]])
+    assert found.profile.name == name
+    assert found.n_beams < 0.6 * SENSORS[name].n_beams
+    if name == "os0-64":
+        with pytest.raises(SensorError, match="a part of a scan, if it is of that sensor"):
+            estimate_sensor([scan[np.abs(elevation) < 15.0]])
+
+
 @pytest.mark.parametrize(("n", "up_deg", "down_deg"), [(16, 10.0, -20.0), (40, 7.0, -16.0), (96, 12.0, -24.0)])
 def test_beams_of_an_unknown_sensor_are_its_profile(n: int, up_deg: float, down_deg: float) -> None:
     elevations_deg = np.linspace(up_deg, down_deg, n)

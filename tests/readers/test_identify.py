@@ -205,7 +205,8 @@ RINGED = [name for name, profile in SENSORS.items() if profile.pattern is None a
 @pytest.mark.parametrize("name", RINGED)
 @pytest.mark.parametrize("from_top", [True, False])
 def test_clouds_are_recognized_by_their_rings(name: str, from_top: bool) -> None:
-    frame = {"os": "os_sensor", "hd": "velodyne", "vl": "velodyne"}.get(name[:2], "hesai_lidar")
+    frames = {"os": "os_sensor", "hd": "velodyne", "vl": "velodyne", "he": "rslidar", "ru": "rslidar"}
+    frame = frames.get(name[:2], "hesai_lidar")
     fields = OUSTER_FIELDS if name.startswith("os") else VELODYNE_FIELDS
     rings: list[float | None] = [*(np.array(beams(name, from_top)) + np.random.default_rng(0).normal(0.0, 0.1))]
     rings[3] = None  # nothing returned
@@ -236,7 +237,7 @@ def test_clouds_are_recognized_by_words(found: dict[str, Any], name: str) -> Non
     [
         (described(["x", "y", "z", "intensity"], "lidar"), "do not name their sensor"),
         (described(["x", "y", "z", "intensity"], "lidar", rings=beams("vlp-16")), "do not name their sensor"),
-        (described(["x", "y", "z", "intensity", "ring", "timestamp"], "rslidar"), "do not name their sensor"),
+        (described(["x", "y", "z", "intensity", "ring", "timestamp"], "rslidar"), "by Robosense, but its model is unk"),
         (described(OUSTER_FIELDS, "velodyne", rings=beams("os1-64")), "do not name their sensor"),
         (described(VELODYNE_FIELDS), "a sensor by Velodyne, but its model is unknown"),
         (described(VELODYNE_FIELDS, rings=[None] * 16), "a sensor by Velodyne, but its model is unknown"),
