@@ -11,6 +11,7 @@ import pytest
 
 from edgeperc.datasets.layout import known_layouts, read_layout
 from edgeperc.errors import SensorError
+from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import PUBLIC_SENSORS, SENSORS, SensorProfile, get_sensor
 
 
@@ -30,6 +31,16 @@ def test_built_in_profiles() -> None:
         assert profile.azimuth_resolution_deg * profile.columns == pytest.approx(360)
         raw = np.array(profile.remission_range)
         np.testing.assert_allclose((raw + profile.remission_offset) * profile.remission_scale, [0, 1])
+
+
+def test_sparse_sensors() -> None:
+    """By their gaps, or by few beams where the range image looks: not those of a JT128 that hangs."""
+    assert {name for name, profile in SENSORS.items() if profile.is_sparse} == {
+        *("vlp-16", "vlp-16-hi-res", "os0-32", "os1-32", "pandarqt-64", "pandarxt-32m", "jt128", "helios-32"),
+        *("helios-16", "rs-bpearl", "mid-360"),
+    }
+    assert not replace(SENSORS["jt128"], mounting=Mounting(2.0, roll_deg=180.0)).is_sparse
+    assert not SENSORS["mid-360"].accumulated(0.5).is_sparse
 
 
 @pytest.mark.parametrize(
