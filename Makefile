@@ -153,7 +153,7 @@ release sbom:
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	.ci/install .venv-test --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,ray,slam,tensorboard,docs,test]'
+	.ci/install .venv-test --constraint constraints.txt --editable '.[cpu,openvino,view,io,ouster,peers,database,argoverse,ray,slam,tensorboard,docs,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt

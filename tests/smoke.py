@@ -40,7 +40,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     ),
     "peers": (["openvino", "stonesoup", "torch"], ["tests/bench/test_peers.py"]),
     "progress": (["tqdm"], ["tests/cli/test_cli.py", "-k", "progress"]),
-    "ray": (["ray.data"], ["tests/system/test_ray_cluster.py", "-k", "ray or process"]),
+    "ray": (["ray"], ["tests/system/test_ray_cluster.py", "-k", "ray or process"]),
     "remote": (["fsspec"], ["tests/system/test_ray_cluster.py", "-k", "memory or fetched or protocol"]),
     "rerun": (["rerun"], ["tests/sinks/test_viewers.py", "-k", "rerun or rrd"]),
     "robot": (["onnxruntime", "zenoh", "velodyne_decoder"], ["tests/ros2/test_ros2_node.py"]),

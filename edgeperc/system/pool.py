@@ -10,8 +10,9 @@ import signal
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from queue import SimpleQueue
 from typing import Any
@@ -59,6 +60,50 @@ def attempt(function: Callable[[Any], Any], item: bytes) -> bytes:
         return pickle.dumps(Lost(traceback.format_exc()))
 
 
+class Worker:
+    """A process that does items; what is common to those of this computer and those of Ray."""
+
+    def __init__(self) -> None:
+        self.numbers: deque[int] = deque()  # of the items that it has
+        self.has_begun = False
+
+    def send(self, number: int, item: Any) -> None:
+        """Give it an item."""
+        self.numbers.append(number)
+        self.begin(pickle.dumps(item))
+
+    def receive(self) -> tuple[int, Any] | None:
+        """The number and the result of its first item; None: it has begun. Raises EOFError, OSError, EdgepercError."""
+        answer = pickle.loads(self.answer())
+        if self.has_begun:
+            return self.numbers.popleft(), answer
+        if answer is not None:
+            raise EdgepercError(f"a worker process could not start: {answer}")
+        self.has_begun = True
+        return None
+
+    @property
+    def end(self) -> Any:
+        """What `map_to_workers` waits for; None: it has nothing to do."""
+        raise NotImplementedError
+
+    def begin(self, item: bytes) -> None:
+        """Let it do a pickled item after those that it has."""
+        raise NotImplementedError
+
+    def answer(self) -> bytes:
+        """The next one, which is there. Raises EOFError or OSError if the process died."""
+        raise NotImplementedError
+
+    def died_of(self) -> Sequence[int]:
+        """The numbers of the items of which it may have died."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """End the process."""
+        raise NotImplementedError
+
+
 def map_in_processes(
     make: Callable[..., Callable[[Any], Any]],
     arguments: tuple[Any, ...],
@@ -77,26 +122,40 @@ def map_in_processes(
     workers : number of processes; None: the number of usable cores divided by ``n_threads``.
     """
     start = pickle.dumps((make, arguments))
-    n = min(workers or max(1, usable_cores() // n_threads), len(items))
-    pool: list[_Process] = []
+    return map_to_workers(partial(_Process, start), wait, items, workers or max(1, usable_cores() // n_threads))
+
+
+def map_to_workers(
+    start: Callable[[], Worker], wait_for: Callable[[list[Any]], Sequence[Any]], items: Sequence[Any], n: int
+) -> Iterator[Any]:
+    """Map items to results, in their order, in at most ``n`` worker processes.
+
+    wait_for : from ends of workers to those with an answer, at least one.
+    """
+    n = min(n, len(items))
+    pool: list[Worker] = []
     todo, results, deaths = deque(range(len(items))), {}, Counter[int]()
     due = 0
     try:
         while due < len(items):
-            pool += [_Process.start(start) for _ in range(min(n, len(todo)) - len(pool))]
-            for process in sorted(pool, key=lambda each: len(each.numbers)):
-                while todo and len(process.numbers) < AHEAD and todo[0] - due < max(MOST_KEPT, n * AHEAD):
-                    process.send(todo[0], items[todo[0]])
+            pool += [start() for _ in range(min(n, len(todo)) - len(pool))]
+            for worker in sorted(pool, key=lambda each: len(each.numbers)):
+                while todo and _takes(worker, pool, todo, deaths) and todo[0] - due < max(MOST_KEPT, n * AHEAD):
+                    worker.send(todo[0], items[todo[0]])
                     todo.popleft()
-            for end in wait([process.end for process in pool]):
-                process = next(each for each in pool if each.end is end)
+            for end in wait_for([worker.end for worker in pool if worker.end is not None]):
+                worker = next(each for each in pool if each.end == end)
                 try:
-                    answer = process.receive()
+                    answer = worker.receive()
                 except (EOFError, OSError):
-                    pool.remove(process)
-                    todo.extendleft(reversed(process.numbers))
-                    if process.died_of(deaths) >= MOST_DEATHS:
-                        results[todo.popleft()] = Lost(DIED)
+                    pool.remove(worker)
+                    todo.extendleft(reversed(worker.numbers))
+                    for number in worker.died_of():
+                        deaths[number] += 1
+                        if deaths[number] >= MOST_DEATHS:
+                            todo.remove(number)
+                            results[number] = Lost(DIED)
+                    worker.stop()
                     continue
                 if answer is not None:
                     results[answer[0]] = answer[1]
@@ -104,58 +163,53 @@ def map_in_processes(
                 yield results.pop(due)
                 due += 1
     finally:
-        for process in pool:
-            process.stop()
+        for worker in pool:
+            worker.stop()
 
 
-@dataclass(eq=False)
-class _Process:
-    """A worker process, and the items that it has."""
+def _takes(worker: Worker, pool: Sequence[Worker], todo: Sequence[int], deaths: Mapping[int, int]) -> bool:
+    """Whether a worker gets the next item. One of which a process died is done alone; no worker waits while another has
+    two.
+    """
+    if not worker.has_begun or not worker.numbers:
+        return worker.has_begun
+    is_alone = any(deaths.get(number) for number in (todo[0], *worker.numbers))
+    return len(worker.numbers) < AHEAD and not is_alone and len(todo) > sum(not each.numbers for each in pool)
 
-    process: Any
-    end: Connection
-    numbers: deque[int] = field(default_factory=deque)
-    has_begun: bool = False
 
-    @classmethod
-    def start(cls, start: bytes) -> _Process:
+class _Process(Worker):
+    def __init__(self, start: bytes) -> None:
+        super().__init__()
         context = multiprocessing.get_context("spawn")
-        end, other = context.Pipe()
-        process = context.Process(target=_work, args=(other, start), daemon=True)
-        process.start()
+        self._end, other = context.Pipe()
+        self._process = context.Process(target=_work, args=(other, start), daemon=True)
+        self._process.start()
         other.close()
-        return cls(process, end)
 
-    def send(self, number: int, item: Any) -> None:
-        self.numbers.append(number)
+    @property
+    def end(self) -> Connection:
+        return self._end
+
+    def begin(self, item: bytes) -> None:
         with contextlib.suppress(OSError):  # of a process that died: the driver learns of it when it reads
-            self.end.send_bytes(pickle.dumps(item))
+            self._end.send_bytes(item)
 
-    def receive(self) -> tuple[int, Any] | None:
-        """The number and the result of its first item; None: it has begun. Raises EOFError, OSError, EdgepercError."""
-        answer = pickle.loads(self.end.recv_bytes())
-        if self.has_begun:
-            return self.numbers.popleft(), answer
-        if answer is not None:
-            raise EdgepercError(f"a worker process could not start: {answer}")
-        self.has_begun = True
-        return None
+    def answer(self) -> bytes:
+        return self._end.recv_bytes()
 
-    def died_of(self, deaths: Counter[int]) -> int:
-        """How often a process died of its first item, with this one. Raises EdgepercError."""
-        self.process.join(LAST_S)
-        ended = f"exit code {self.process.exitcode}"
+    def died_of(self) -> Sequence[int]:
+        """Its first item: what it did before was written into the pipe."""
+        self._process.join(LAST_S)
         if not self.has_begun or not self.numbers:
-            raise EdgepercError(f"a worker process ended before its work ({ended})")
-        deaths[self.numbers[0]] += 1
-        return deaths[self.numbers[0]]
+            raise EdgepercError(f"a worker process ended before its work (exit code {self._process.exitcode})")
+        return [self.numbers[0]]
 
     def stop(self) -> None:
-        self.end.close()
-        self.process.join(LAST_S if not self.numbers else 0.0)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
+        self._end.close()
+        self._process.join(LAST_S if not self.numbers else 0.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
 
 
 def _work(end: Connection, start: bytes) -> None:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import pickle
 import signal
 import threading
-from collections import Counter
+import traceback
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
+from ..errors import EdgepercError
 from .extras import require
-from .pool import DIED, MOST_DEATHS, Lost, attempt, map_in_processes
+from .pool import MOST_DEATHS, Worker, attempt, map_in_processes, map_to_workers
 
-# Items of a block, the unit that a worker is given. Few, because all are done again if its process dies. Many, because
-# the driver keeps some kilobytes for each block.
-MOST_IN_BLOCK = 16
 # A local cluster's memory for items and results in transit; Ray's own default is 30 % of the computer's.
 STORE_BYTES = 256 * 2**20
 
@@ -42,8 +41,6 @@ def map_on_ray(
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns about a future default
     ray = require("ray", "ray", "--engine ray")
-    data = require("ray.data", "ray", "--engine ray", package="ray[data]")
-    logging.getLogger("ray.data").setLevel(logging.ERROR)  # the rest is in Ray's log files
     started = not ray.is_initialized()
     if started:
         local: dict[str, Any] = {}
@@ -52,21 +49,9 @@ def map_on_ray(
         with signals_kept():
             ray.init(**local, include_dashboard=False, log_to_driver=False, configure_logging=False)
     try:
-        context = data.DataContext.get_current()
-        context.enable_progress_bars = False
-        context.execution_options.preserve_order = True
         n_workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // n_threads)
-        n_blocks = max(min(len(items), 4 * n_workers), -(-len(items) // MOST_IN_BLOCK))
-        rows = [{"number": k, "item": pickle.dumps(item)} for k, item in enumerate(items)]
-        # A process that dies, or whose computer is taken away, is replaced, and its block is done again.
-        done = data.from_items(rows, override_num_blocks=n_blocks).map_batches(
-            _Worker,
-            fn_constructor_args=(make, arguments, ray.remote(_Deaths).options(num_cpus=0).remote()),
-            compute=data.ActorPoolStrategy(size=min(n_workers, n_blocks)),
-            num_cpus=n_threads,
-        )
-        for row in done.iter_rows():
-            yield pickle.loads(row["result"])
+        start = partial(_Actor, ray, ray.put((make, arguments)), n_threads, [])
+        yield from map_to_workers(start, lambda ends: ray.wait(ends)[0], items, n_workers)
     finally:
         if started:
             ray.shutdown()
@@ -82,36 +67,60 @@ def signals_kept() -> Iterator[None]:
         signal.signal(signal.SIGTERM, handler)
 
 
-class _Deaths:
-    """How often the process of an item died, for all workers."""
+class _Actor(Worker):
+    """A process of the cluster. It starts when CPUs are free: until then others do all items."""
 
-    def __init__(self) -> None:
-        self._begun: Counter[int] = Counter()
+    def __init__(self, ray: Any, start: Any, n_threads: int, failed: list[str]) -> None:
+        super().__init__()
+        self._ray = ray
+        self._failed = failed  # why processes ended that had not begun, since one began
+        self._actor = ray.remote(_Remote).options(num_cpus=n_threads).remote()
+        self._answers = deque([self._actor.start.remote(start)])
 
-    def begin(self, number: int) -> int:
-        """Note that a process begins with an item; returns how often one died of it."""
-        self._begun[number] += 1
-        return self._begun[number] - 1
+    @property
+    def end(self) -> Any:
+        return self._answers[0] if self._answers else None
 
-    def end(self, number: int) -> None:
-        """Note that it is done."""
-        self._begun[number] -= 1
+    def begin(self, item: bytes) -> None:
+        self._answers.append(self._actor.do.remote(item))
+
+    def answer(self) -> bytes:
+        try:
+            answer: bytes = self._ray.get(self._answers.popleft())
+        except self._ray.exceptions.RayTaskError as exc:  # a computer of the cluster without edgeperc, say
+            raise EdgepercError(f"a worker process could not start: {exc}") from exc
+        except self._ray.exceptions.RayError as exc:
+            if not self.has_begun:
+                self._failed.append(str(exc))
+            raise EOFError from exc
+        self._failed.clear()
+        return answer
+
+    def died_of(self) -> Sequence[int]:
+        """All its items: the answer to the first one may have been lost with the process."""
+        if len(self._failed) >= MOST_DEATHS:
+            raise EdgepercError(f"{MOST_DEATHS} worker processes ended before their work: {self._failed[-1]}")
+        return self.numbers
+
+    def stop(self) -> None:
+        self._ray.kill(self._actor)
 
 
-class _Worker:
-    """The function of a worker process for Ray Data, which maps columns to columns."""
+class _Remote:
+    """What an actor's process does."""
 
-    def __init__(self, make: Callable[..., Callable[[Any], Any]], arguments: tuple[Any, ...], deaths: Any) -> None:
-        self._ray = require("ray", "ray", "--engine ray")
-        self._function, self._deaths = make(*arguments), deaths
+    def start(self, start: tuple[Callable[..., Callable[[Any], Any]], tuple[Any, ...]]) -> bytes:
+        """Make its function; the answer says what cannot be made."""
+        make, arguments = start
+        try:
+            self._function = make(*arguments)
+        except Exception:
+            return pickle.dumps(traceback.format_exc())
+        return pickle.dumps(None)
 
-    def __call__(self, batch: dict[str, Any]) -> Iterator[dict[str, list[Any]]]:
-        """Map a block, item by item."""
-        for number, item in zip(batch["number"].tolist(), batch["item"], strict=True):
-            may_run = self._ray.get(self._deaths.begin.remote(number)) < MOST_DEATHS
-            result = attempt(self._function, item) if may_run else pickle.dumps(Lost(DIED))
-            self._deaths.end.remote(number)
-            yield {"result": [result]}
+    def do(self, item: bytes) -> bytes:
+        """The pickled result of a pickled item."""
+        return attempt(self._function, item)
 
 
 ENGINES: Mapping[str, Callable[..., Iterator[Any]]] = MappingProxyType({"local": map_in_processes, "ray": map_on_ray})

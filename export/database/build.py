@@ -80,7 +80,7 @@ def build(
     engine: Literal["local", "ray"] = "local",
     workers: int | None = None,
 ) -> Report:
-    """Build a database, or resume a stopped build, here or by ``ray.data``. Drawn roads (COCO files) take precedence
+    """Build a database, or resume a stopped build, here or on a Ray cluster. Drawn roads (COCO files) take precedence
     over the road model, of ``recipe`` if it is to be trained. Raises DatabaseError and the errors of models.
     """
     objects = KittiObjects(plan.kitti)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from pool_tasks import dying, failing, scaled, slowest_first, without_pickle
 
 from edgeperc.errors import EdgepercError
 from edgeperc.evaluation.transfer import compare
-from edgeperc.system.pool import MOST_KEPT, Lost, map_in_processes
+from edgeperc.system.pool import MOST_KEPT, Lost, Worker, map_in_processes, map_to_workers
 
 
 @pytest.mark.parametrize(("workers", "n"), [(1, 0), (2, 1), (3, 100), (None, 9)])
@@ -48,6 +50,55 @@ def test_a_result_that_cannot_be_sent_is_lost() -> None:
     found = list(map_in_processes(without_pickle, (), range(3), workers=1))
     assert (found[0], found[2]) == (0, 2)
     assert "pickle" in found[1].reason
+
+
+class Fragile(Worker):
+    """A process that takes what it has done with it when it dies of an item."""
+
+    def __init__(self, deadly: set[int]) -> None:
+        super().__init__()
+        self.deadly, self.done = deadly, 0
+
+    @property
+    def end(self) -> Any:
+        return self if self.numbers or not self.has_begun else None
+
+    def begin(self, item: bytes) -> None:
+        pass
+
+    def answer(self) -> bytes:
+        if self.deadly & {*self.numbers}:
+            raise EOFError
+        self.done += self.has_begun
+        return pickle.dumps(10 * self.numbers[0] if self.has_begun else None)
+
+    def died_of(self) -> Sequence[int]:
+        return self.numbers
+
+    def stop(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("n_workers", [1, 2, 3])
+@pytest.mark.parametrize("deadly", [{0}, {4}, {4, 5}, {19}])
+def test_items_before_one_that_kills_its_process_are_not_lost(deadly: set[int], n_workers: int) -> None:
+    for wait in (lambda ends: ends, lambda ends: ends[:1], lambda ends: ends[-1:]):
+        found = [*map_to_workers(lambda: Fragile(deadly), wait, range(20), n_workers)]
+        assert {k for k, each in enumerate(found) if isinstance(each, Lost)} == deadly
+        assert [each for each in found if not isinstance(each, Lost)] == [10 * k for k in range(20) if k not in deadly]
+
+
+@pytest.mark.parametrize(("n_items", "done"), [(2, [1, 1]), (3, [1, 2]), (40, [20, 20])])
+def test_no_worker_waits_while_another_has_two_items(n_items: int, done: list[int]) -> None:
+    """Of two drives, one process did both, and the other one nothing."""
+    workers: list[Fragile] = []
+
+    def start() -> Fragile:
+        workers.append(Fragile(set()))
+        return workers[-1]
+
+    assert [*map_to_workers(start, lambda ends: ends, range(n_items), 2)] == [10 * k for k in range(n_items)]
+    assert sorted(worker.done for worker in workers) == done
 
 
 @pytest.mark.parametrize(("make", "message"), [(failing, "no such model"), (dying, "exit code 4")])

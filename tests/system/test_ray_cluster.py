@@ -25,7 +25,7 @@ from edgeperc import cli
 from edgeperc.cli import side_by_side
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.scans import Sensors
-from edgeperc.errors import MissingExtraError, OptionError, PointsError
+from edgeperc.errors import EdgepercError, MissingExtraError, OptionError, PointsError
 from edgeperc.ground.leveling import MountingEstimator
 from edgeperc.perceiver import Perceiver
 from edgeperc.preprocess.health import Normal
@@ -62,7 +62,6 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cluster() -> Iterator[None]:
     """A Ray cluster of two processes, for all tests here: starting one takes seconds."""
     ray = pytest.importorskip("ray")
-    pytest.importorskip("pyarrow")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     with signals_kept():
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=2**28)
@@ -214,6 +213,21 @@ def test_an_item_that_kills_its_process_is_lost_alone() -> None:
     assert [each for each in found if not isinstance(each, Lost)] == [10 * k for k in range(40) if k not in (5, 7)]
 
 
+@pytest.mark.usefixtures("cluster")
+@pytest.mark.parametrize(
+    ("dies", "message"), [(False, "could not start: .*no such model"), (True, "2 worker processes ended before")]
+)
+def test_what_cannot_start_on_ray_is_an_error(dies: bool, message: str) -> None:
+
+    def make() -> Callable[[int], int]:
+        if dies:
+            os._exit(4)
+        raise ValueError("no such model")
+
+    with pytest.raises(EdgepercError, match=f"(?s){message}"):
+        list(map_on_ray(make, (), range(4), workers=1))
+
+
 def test_a_perceiver_starts_from_what_another_learned(scans: Path) -> None:
     """The mounting is that of the first scans; the perceiver has its own otherwise."""
     one, other = (Perceiver("pointseg", sensor="vlp-16", provider="cpu", on_mismatch="ignore") for _ in range(2))
@@ -359,7 +373,6 @@ def test_scans_at_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
 
 def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, alone: Any) -> None:
     pytest.importorskip("ray")
-    pytest.importorskip("pyarrow")
     for path in scans.iterdir():
         Remote(f"{bucket}/scans/{path.name}").write_bytes(path.read_bytes())
     files, records = alone
