@@ -146,7 +146,8 @@ def test_what_is_counted_is_what_is_used(first: tuple[Path, Any], options: dict[
         file.unlink()  # nothing is counted as long as nothing is missing
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [sys.executable, "-W", "ignore", "-c", LATER, json.dumps(options)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    # Elsewhere: `-c` would import what lies in the working directory, whose kernels are not those of the first start.
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     called, used, counted = map(set, json.loads(done.stdout))
     assert called <= used <= counted
