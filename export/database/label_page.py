@@ -65,6 +65,7 @@ class LabelServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 64  # of more than 5 at once, which is the default, the others would try again after a second
 
     def __init__(self, root: Path, polygons: Path, *, kitti: Path | None = None, port: int = 0) -> None:
         self.database = TopViewDatabase(root)

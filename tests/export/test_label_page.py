@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import http.client
@@ -501,6 +502,13 @@ def test_the_number_of_connections_is_limited(out: Path, tmp_path: Path, monkeyp
         while (status := status_of_scenes(server)) != 200 and time.monotonic() < until:
             time.sleep(0.02)
         assert status == 200
+
+
+def test_connections_wait_while_the_server_is_busy(out: Path, tmp_path: Path) -> None:
+    """Of more than five, the others tried again a second later."""
+    with LabelServer(out, tmp_path / "road.json") as busy, contextlib.ExitStack() as opened:
+        for _ in range(20):
+            opened.enter_context(socket.create_connection(("127.0.0.1", busy.server_address[1]), timeout=5.0))
 
 
 def status_of_scenes(server: LabelServer) -> int | None:
