@@ -71,6 +71,7 @@ def test_cuts_at_every_byte(recording: Path, tmp_path: Path) -> None:
         ends -= {*range(text.start() + 1, text.end())} - {*range(text.start(), text.end(), 37)}
     most = 0
     for end in sorted(ends):
+        path.unlink(missing_ok=True)  # to write over a file waits for the disk
         path.write_bytes(content[:end])
         n, error = whole_scans(path)
         assert error or n == 3  # the index behind all messages is not needed
@@ -95,6 +96,7 @@ def test_damaged_bytes_are_typed_errors(recording: Path, tmp_path: Path, place: 
     start = int(place * (len(content) - 1))
     content[start : start + len(damage)] = damage
     path = tmp_path / recording.name
+    path.unlink(missing_ok=True)
     path.write_bytes(content)
     try:
         for scan in decoded(path):
