@@ -572,6 +572,9 @@ class Perceiver:
             found: dict[str, str] = {}
             if perception.dropped.too_near:
                 found["too near"] = about_too_near(perception.dropped, perception.n_points, self.sensor)
+            detector = None if scan is None or self._pipeline is None else self._pipeline.pillars
+            if detector is not None and (left_out := detector.about_left_out()):
+                found["left out"] = left_out
             if perception.health is not None and self.on_mismatch != "ignore":
                 found |= findings_of(perception.health)
             news = [text for kind, text in found.items() if kind not in self._told_of]

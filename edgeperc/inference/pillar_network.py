@@ -36,13 +36,16 @@ class PillarNetwork:
         height_m, yaws_deg = session.card.mount_height_m, [view.yaw_deg + 90.0 * k for k in range(quarters)]
         self.frames = [ModelFrame(Mounting(height_m, 0.0, view.pitch_deg, math.remainder(y, 360.0))) for y in yaws_deg]
         self.field = field_of(session.card, full_turn)
+        self._n_left_out = 0
 
     def find_boxes(self, points: Points) -> Sequence[Box]:
         """Boxes in the frame of the models, best score first."""
         boxes: list[Box] = []
         labels: list[int] = []
+        self._n_left_out = 0
         for frame in self.frames:
             n = self._pillarizer.fill(frame.move_back(points))
+            self._n_left_out += self._pillarizer.n_left_out
             if n == 0:
                 continue
             for taken, array in self._beside:
@@ -55,6 +58,16 @@ class PillarNetwork:
         scores = np.array([box.score for box in boxes])
         kept = distinct_rows(self.card, rectangles(boxes), scores, np.array(labels, np.int64))
         return [boxes[row] for row in kept.tolist()]
+
+    def about_left_out(self) -> str:
+        """What to say if pillars of the last scan had no room; else nothing."""
+        if not self._n_left_out:
+            return ""
+        return (
+            f"{self.card.name} does not see {self._n_left_out:,} points of the scan: they lie in pillars beyond the "
+            f"first {self.view.max_pillars:,}, view.max_pillars of its card. Raise it; export a graph that takes a "
+            "fixed number anew"
+        )
 
 
 def field_of(card: ModelCard, full_turn: bool) -> TopViewGeometry:

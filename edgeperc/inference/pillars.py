@@ -53,18 +53,21 @@ class Pillarizer:
         """Arrays of `pillars` in the order of the graph's inputs (`edgeperc.inference.session.input_shapes`)."""
         self._members = np.empty((n, m), np.int32)
         self._numbers = np.full((view.height, view.width), -1, np.int32)
+        self.n_left_out = 0
+        """Points of the last scan whose pillars had no room."""
 
     def fill(self, points: Points) -> int:
         """Write the pillars of points (n, 4) in the frame of the training points; returns how many."""
         points = read_only(points)
-        n = find_pillars(points, self._grid, self._numbers, self._members, self.pillars)
+        n, self.n_left_out = find_pillars(points, self._grid, self._numbers, self._members, self.pillars)
         fill_pillars(points, self._grid, self._channels, self._scale, self._members, n, self.pillars)
         return n
 
 
 @njit(cache=True, nogil=True)
-def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> int:
-    """Write the counts and places of pillars, in the order of their first points; returns how many had room.
+def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints, pillars: Pillars) -> tuple[int, int]:
+    """Write the counts and places of pillars, in the order of their first points; returns how many had room, and the
+    number of points in others.
 
     numbers : (rows, columns) -1 everywhere before and after.
     members : (pillars, points) overwritten; rows of the points of each pillar, the first ones of the scan.
@@ -73,7 +76,7 @@ def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints,
     # In float32 as spconv and mmcv divide: points of sensors that round lie on the edges of cells by the thousand.
     low_x, low_y, low_z = np.float32(grid.low[0]), np.float32(grid.low[1]), np.float32(grid.low[2])
     cell, tall = np.float32(grid.cell), np.float32(grid.high[2] - grid.low[2])
-    n = 0
+    n, n_left_out = 0, 0
     for i in range(points.shape[0]):
         x, y, z = (points[i, 0] - low_x) / cell, (points[i, 1] - low_y) / cell, (points[i, 2] - low_z) / tall
         inside = (0.0 <= x < n_columns) & (0.0 <= y < n_rows) & (0.0 <= z < 1.0)
@@ -83,6 +86,7 @@ def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints,
         k = numbers[row, column]
         if k < 0:
             if n == members.shape[0]:
+                n_left_out += 1
                 continue
             k = n
             numbers[row, column] = k
@@ -95,7 +99,7 @@ def find_pillars(points: Points, grid: PillarGrid, numbers: Ints, members: Ints,
             pillars.counts[k] += 1
     for k in range(n):
         numbers[pillars.places[k, 2], pillars.places[k, 3]] = -1
-    return n
+    return n, n_left_out
 
 
 @njit(cache=True, nogil=True)

@@ -30,8 +30,8 @@ clouds = st.lists(st.tuples(coordinates, coordinates, coordinates, st.floats(0.0
 def compare(maker: Pillarizer, points: NDArray[np.float32], channels: tuple[str, ...]) -> int:
     n = maker.fill(points)
     mean, std = np.arange(len(channels)) / 8.0, 1.0 + np.arange(len(channels)) / 4.0
-    values, counts, places = twins.pillars.pillars(points, VIEW, channels, mean, std)
-    assert n == len(counts)
+    values, counts, places, n_left_out = twins.pillars.pillars(points, VIEW, channels, mean, std)
+    assert (n, maker.n_left_out) == (len(counts), n_left_out)
     np.testing.assert_array_equal(maker.pillars.counts[:n], counts)
     np.testing.assert_array_equal(maker.pillars.places[:n], places)
     np.testing.assert_allclose(maker.pillars.values[:n], values, atol=1e-5)

@@ -11,8 +11,10 @@ from edgeperc.types.detector import PillarGeometry
 
 def pillars(
     points: np.ndarray, view: PillarGeometry, channels: Sequence[str], mean: np.ndarray, std: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Twin of `edgeperc.inference.pillars.Pillarizer.fill`: values, counts and places of the pillars."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Twin of `edgeperc.inference.pillars.Pillarizer.fill`: values, counts and places of the pillars, and the number of
+    points without room.
+    """
     bounds = np.array([view.x_range_m, view.y_range_m, view.z_range_m])
     size = np.float32([view.cell_m, view.cell_m, bounds[2, 1] - bounds[2, 0]])
     with np.errstate(invalid="ignore"):
@@ -24,6 +26,7 @@ def pillars(
     for point, (column, row, _) in zip(points[inside].astype(np.float64), at[inside].astype(int).tolist(), strict=True):
         cells.setdefault((row, column), []).append(point)
     kept = list(cells.items())[: view.max_pillars]
+    n_left_out = sum(len(members) for members in [*cells.values()][view.max_pillars :])
     values = np.zeros((len(kept), view.max_points, len(channels)))
     for k, ((row, column), members) in enumerate(kept):
         some = np.array(members[: view.max_points])
@@ -39,4 +42,4 @@ def pillars(
         values[k, : len(some)] = (raw - mean) / std
     counts = np.array([min(len(members), view.max_points) for _, members in kept], np.int32)
     places = np.array([(0, 0, row, column) for (row, column), _ in kept], np.int32).reshape(-1, 4)
-    return values, counts, places
+    return values, counts, places, n_left_out
