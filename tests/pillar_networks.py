@@ -94,6 +94,19 @@ class PillarNet(nn.Module):
         return tuple(each.permute(0, 2, 3, 1) if self.kind == "anchors" else each for each in outputs)
 
 
+class _WithSigmoid(PillarNet):
+    def forward(self, voxels: Tensor, num_points: Tensor, coords: Tensor) -> tuple[Tensor, ...]:
+        scores, *others = super().forward(voxels, num_points, coords)
+        return (scores.sigmoid(), *others)
+
+
+def with_sigmoid(network: PillarNet) -> PillarNet:
+    """The same network, whose scores are probabilities."""
+    other = _WithSigmoid(network.kind, decorated=network.decorated)
+    other.load_state_dict(network.state_dict())
+    return other.eval()
+
+
 def inputs_of(card: ModelCard, points: NDArray[np.float32]) -> tuple[Tensor, ...]:
     """The pillars of a scan in the frame of the network, as tensors."""
     maker = Pillarizer(card.view, card.input)

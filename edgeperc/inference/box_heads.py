@@ -163,6 +163,12 @@ def decode_dense(
     if not card.box_classes:
         return []
 
+    check_logits(
+        float(maps[0].min()),
+        float(maps[0].max()),
+        f"{card.name}: values of the heat map of box_dense",
+        "Export the network without the sigmoid of this output",
+    )
     peak = np.empty(maps.shape[1:], np.bool_)
     mark_peaks(maps[0], logit(score_threshold), peak)
     rows, cols = np.nonzero(peak)
@@ -246,6 +252,17 @@ def raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> NoReturn:
         f"{model}: {n_bad} of {n} values of {kind} are not finite; expected numbers. "
         "Check the scan's units, or run the model with provider='cpu' and precision='fp32'"
     )
+
+
+def check_logits(lowest: float, highest: float, what: str, advice: str) -> None:
+    """Raise `InferenceError` for logits of objects at all positions of a map that are probabilities, by their bounds.
+
+    As logits, they would be an object everywhere. A map of zeros may be either.
+    """
+    if lowest >= 0.0 and 0.0 < highest <= MAX_PROBABILITY:
+        raise InferenceError(
+            f"{what} are {lowest:g} to {highest:g}, as after a sigmoid; expected logits, most of them below 0. {advice}"
+        )
 
 
 def logit(probability: float) -> float:

@@ -13,7 +13,7 @@ from ..types.detector import CENTER_VALUES, AnchorHead, CenterHead, PillarGeomet
 from ..types.geometry import suppress_overlaps, wrapped
 from ..types.perception import Box
 from ..types.points import Floats, Floats32, Ints64
-from .box_heads import MAX_PROBABILITY, SIZE_RANGE_M, check_finite, logit, sigmoid
+from .box_heads import MAX_PROBABILITY, SIZE_RANGE_M, check_finite, check_logits, logit, sigmoid
 
 BEYOND_M = 5.0
 """A box whose center is farther out of the view is dropped."""
@@ -163,6 +163,10 @@ def _best(
     for k in range(1, raw.shape[3]):  # a third of the time of a maximum along the short axis
         np.maximum(best, raw[..., k], out=best)
     are_logits = head.scores == "logits"
+    what = "the best scores of the head's positions"
+    if are_logits and best.size:
+        advice = "Check the card: an output with sigmoid has head.scores probabilities"
+        check_logits(float(best.min()), float(best.max()), what, advice)
     least = logit(score_threshold) if are_logits else score_threshold
     at = np.flatnonzero(best.reshape(-1) >= least)
     values = best.reshape(-1)[at]
@@ -171,7 +175,7 @@ def _best(
     scores = sigmoid(values[order].astype(np.float64)) if are_logits else values[order].astype(np.float64)
     if not are_logits and best.size and not (best.min() >= 0.0 and best.max() <= MAX_PROBABILITY):
         raise InferenceError(
-            f"the best scores of the head's positions are {best.min():g} to {best.max():g}; expected probabilities, 0 "
+            f"{what} are {best.min():g} to {best.max():g}; expected probabilities, 0 "
             "to 1. Check the card: an output without sigmoid or softmax has head.scores logits"
         )
     return place, raw[place].argmax(axis=1), np.clip(scores, 0.0, 1.0)

@@ -369,6 +369,12 @@ class ModelCard:
                 f"box_classes {reprlib.repr(self.box_classes)} of a detector of {len(head.classes)} classes "
                 f"{reprlib.repr(head.classes)}; expected a class of boxes for each, in this order"
             )
+        for own, name in zip(head.classes, self.box_classes, strict=True):
+            if own.lower() != name and own.lower() in self.box_classes:
+                raise CardError(
+                    f"box_classes {reprlib.repr(self.box_classes)} call the network's {own!r} {name!r}; expected what "
+                    f"edgeperc calls each of head.classes {reprlib.repr(head.classes)}, in their order"
+                )
         n_values = view.max_pillars * view.max_points * len(self.input.channels)
         if n_values > MAX_VALUES:
             raise CardError(f"the input has {n_values} values (view.max_pillars); expected at most {MAX_VALUES}")

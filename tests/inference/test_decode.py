@@ -400,6 +400,14 @@ def test_score_thresholds_0_and_1() -> None:
     assert decode_dense(card_like(box_classes=()), dense, class_logits(), "class_logits", 0.3) == []
 
 
+def test_a_heat_map_of_probabilities_is_refused() -> None:
+    """As logits, each of its peaks was a box with a score of 0.5 or more."""
+    dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
+    dense[0, 0] = 1.0 / (1.0 + np.exp(-dense[0, 0]))
+    with pytest.raises(InferenceError, match=r"ssadnet: values of the heat map .* are .* expected logits.* sigmoid of"):
+        dense_boxes(dense, name="ssadnet")
+
+
 def test_dense_clips_extreme_sizes_and_refuses_non_finite_values() -> None:
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     dense[0, [3, 4, 8], 50, 25] = 200.0, -200.0, 90.0

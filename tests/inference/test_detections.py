@@ -427,6 +427,31 @@ def test_logits_that_a_card_calls_probabilities_are_refused() -> None:
         decoded({kind: (kind, values) for kind, values in maps.items()}, replace(GROUPS, scores="probabilities"))
 
 
+@pytest.mark.parametrize("kind", HEADS)
+def test_probabilities_that_a_card_calls_logits_are_refused(
+    kind: str, trained: dict[str, PillarNet], tmp_path: Path
+) -> None:
+    """Each position of the map was a box with a score from 0.5 to 0.73."""
+    network = networks.with_sigmoid(trained[kind])
+    path, card = networks.exported(network, tmp_path / "sigmoid.onnx"), card_of(kind)
+    with pytest.raises(InferenceError, match=r"positions are .* expected logits.* has head\.scores probabilities"):
+        perceived(path, simulated_scan(0).points)
+    likely = replace(card, head=replace(card.head, scores="probabilities"))
+    assert perceived(networks.exported(network, path, likely), simulated_scan(0).points).boxes
+
+
+def test_a_scan_with_more_pillars_than_its_card_has(
+    trained: dict[str, PillarNet], points: NDArray[np.float32], tmp_path: Path
+) -> None:
+    """The rest of the scan was not seen, and nothing said so."""
+    card = replace(card_of("anchors"), view=replace(VIEW, max_pillars=200))
+    path = networks.exported(trained["anchors"], tmp_path / "few.onnx", card)
+    perceive = Perceiver(path, provider="cpu", n_threads=1, mounting=MODEL_MOUNTING, on_mismatch="ignore")
+    with pytest.warns(UserWarning, match=r"does not see [\d,]+ points .*beyond the first 200, view\.max_pillars"):
+        perceive(points)
+    perceive(points)  # said once
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_boxes_of_a_group_do_not_overlap(seed: int) -> None:
     """Whatever their classes, as in OpenPCDet and mmdetection3d; those of two groups may."""

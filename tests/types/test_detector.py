@@ -156,6 +156,12 @@ def test_outputs_are_those_of_the_head(outputs: list[str], message: str) -> None
         refuse(other, "of a center head; expected heatmap, reg, height, dim and rot")
 
 
+@pytest.mark.parametrize("names", [["pedestrian", "car", "cyclist"], ["car", "cyclist", "pedestrian"]])
+def test_classes_of_boxes_in_another_order_are_refused(names: list[str]) -> None:
+    """Each pedestrian was called a car."""
+    refuse(document() | {"box_classes": names}, r"call the network's '\w+' '\w+'; expected .* head\.classes .* order")
+
+
 def test_a_head_is_of_pillars_alone() -> None:
     given = document()
     del given["head"]
