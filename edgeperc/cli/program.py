@@ -22,7 +22,6 @@ from ..system.names import nearest
 from ..system.printable import printable
 from .output import print_error, show_warning
 
-_FOLDER_GONE = "the current folder was removed; change to another one"
 # Modules with functions that native code calls.
 _DELICATE = ("llvmlite.", "numba.core.serialize", "importlib._bootstrap", "edgeperc.sinks.run_file", "logging")
 
@@ -63,8 +62,8 @@ class _TerminatedError(SystemExit):
 
 def run_program(program: str, command: Callable[[], int | None], message: Callable[[Exception], str] = str) -> int:
     """Run a program's command line, its warnings and errors (as ``message`` says them) one line each on stderr; 2 after
-    an `EdgepercError` or `OSError`, 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP, 141 in silence if what reads
-    it closed it.
+    an `EdgepercError`, `OSError` or `MemoryError`, 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP, 141 in
+    silence if what reads it closed it.
     """
     _fill_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -83,12 +82,11 @@ def run_program(program: str, command: Callable[[], int | None], message: Callab
             if isinstance(exc, KeyboardInterrupt) and not raised:  # by the process's own handler
                 raised.append(signal.SIGINT)
             if not raised:  # else it may be what native code raised in place of the signal's
-                if not isinstance(exc, EdgepercError | OSError):
+                if not isinstance(exc, EdgepercError | OSError | MemoryError):
                     raise
                 if isinstance(exc, BrokenPipeError) and _unread():
                     return 141
-                is_gone = isinstance(exc, FileNotFoundError) and exc.filename is None  # only `os.getcwd` says so
-                print_error(_FOLDER_GONE if is_gone else message(exc), program)
+                print_error(_of_system(exc) or message(exc), program)
                 return 2
         if raised:
             print_error("interrupted" if raised[0] == signal.SIGINT else "terminated", program)
@@ -98,6 +96,18 @@ def run_program(program: str, command: Callable[[], int | None], message: Callab
         if _unread():
             return 141
         raise
+
+
+def _of_system(exc: Exception) -> str:
+    """What happened and what to do, where the system's own words do not say it; else nothing."""
+    if isinstance(exc, MemoryError):
+        what = f": {exc}" if str(exc) else ""  # numba's says nothing
+        return f"there is not enough memory{what}; raise the process's limit (ulimit -v, its container's)"
+    if isinstance(exc, FileNotFoundError) and exc.filename is None:  # only `os.getcwd` says so
+        return "the current folder was removed; change to another one"
+    if isinstance(exc, FileExistsError | NotADirectoryError) and exc.filename is not None:
+        return f"{exc.filename}: a file is where a folder has to be; expected a folder, or a name that is free"
+    return ""
 
 
 def _fill_streams() -> None:

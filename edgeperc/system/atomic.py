@@ -22,7 +22,7 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     """
     path = Path(os.path.realpath(OPTIONS.path("path", path)))
     if path.exists() and not path.is_file():
-        with path.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+        with _named(path), path.open(mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file
         return
     temporary = beside(path)
@@ -31,17 +31,25 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
         return os.open(name, flags | os.O_EXCL, permissions)
 
     try:
-        with open(temporary, mode, encoding=None if "b" in mode else "utf-8", opener=opener) as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with _named(path, temporary):
+            with open(temporary, mode, encoding=None if "b" in mode else "utf-8", opener=opener) as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _named(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Let an `OSError` of writing have the path of the target."""
+    try:
+        yield
     except OSError as exc:
         if exc.errno is not None and exc.filename in (None, str(temporary)):  # None: of a full disk
             exc.filename = str(path)
         raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, content: bytes, permissions: int = 0o666) -> None:

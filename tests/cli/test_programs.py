@@ -7,6 +7,7 @@ import importlib
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -205,6 +206,25 @@ def test_a_folder_that_is_gone_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     folder.rmdir()
     assert run_program("program", lambda: len(Path().resolve().parts)) == 2
     assert capsys.readouterr().err == "program: the current folder was removed; change to another one\n"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 8 GiB")])
+def test_without_memory_a_program_says_so(error: MemoryError, capsys: Any) -> None:
+    """It ended with a traceback, and with the exit code of scans that failed."""
+    assert run_program("program", Mock(side_effect=error)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"program: there is not enough memory(: Unable to allocate 8 GiB)?; raise the .* limit.*", line)
+
+
+def test_a_file_where_a_folder_has_to_be(tmp_path: Path, capsys: Any) -> None:
+    (file := tmp_path / "file").touch()
+    for folder in (file, file / "below"):
+        assert run_program("program", partial(folder.mkdir, parents=True, exist_ok=True)) == 2
+        error = capsys.readouterr().err
+        assert (
+            error
+            == f"program: {folder}: a file is where a folder has to be; expected a folder, or a name that is free\n"
+        )
 
 
 def test_a_program_runs_in_any_thread() -> None:
