@@ -20,7 +20,7 @@ from .readers.identify import contradicts
 from .readers.ports import is_port
 from .readers.times import TimedScan, accumulate
 from .system.clock import LATEST_S, Clock, as_seconds
-from .system.fields import SCANS
+from .system.fields import MAX_NUMBER, SCANS
 from .types.perception import Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile
@@ -152,7 +152,7 @@ def stream(
 
 def check_rate(rate_hz: float) -> None:
     """Refuse a rate that is none. Raises OptionError."""
-    if not (isinstance(rate_hz, Real) and 0.0 < rate_hz < math.inf):
+    if not (isinstance(rate_hz, Real) and 0.0 < rate_hz <= MAX_NUMBER):
         raise OptionError(f"rate_hz is {rate_hz!r}; expected scans a second, above 0")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
@@ -98,7 +98,7 @@ def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
 
 
 def _check_choice(option: str, value: object, choices: Sequence[object]) -> None:
-    if value not in choices:
+    if not isinstance(value, Hashable) or value not in choices:  # an array is compared element by element
         *others, last = known = [*map(str, choices)]
         raise OptionError(f"{option} is {value!r}{nearest(str(value), known)}; expected {', '.join(others)} or {last}")
 
@@ -258,8 +258,9 @@ class Perceiver:
         _check_choice("boxes_from", boxes_from, get_args(BoxesFrom))
         _check_choice("full_turn", full_turn, (True, False))
         _check_choice("trusted", trusted, (True, False))
-        rules = agree if isinstance(agree, Collection) and not isinstance(agree, str) else None
-        if agree not in (True, False) if rules is None else any(name not in [*RULES] for name in rules):
+        rules = agree if isinstance(agree, Collection) and not isinstance(agree, str | np.ndarray) else None
+        known = isinstance(agree, Hashable) and agree in (True, False)
+        if not known if rules is None else any(name not in [*RULES] for name in rules):
             raise OptionError(f"agree is {agree!r}; expected True, False or some of {', '.join(sorted(RULES))}")
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
             raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")

@@ -246,6 +246,7 @@ def test_a_source_that_is_none(source: Any) -> None:
         {"rate_hz": 0.0},
         {"rate_hz": np.nan},
         {"rate_hz": np.inf},
+        {"rate_hz": 10**400},
         {"rate_hz": "10"},
         {"late_after_s": "1"},
         {"late_after_s": 0.0},

@@ -8,6 +8,7 @@ import inspect
 import pickle
 import pkgutil
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,9 @@ def test_errors_have_one_root_and_come_out_of_other_processes() -> None:
         assert repr(pickle.loads(pickle.dumps(error))) == repr(error)
 
 
+NO_ROAD = edgeperc.TopView(
+    np.zeros((4, 4), np.uint8), ("background", "drivable"), 1.0, (0.0, 4.0), (-2.0, 2.0), np.zeros((4, 4), np.bool_)
+)
 WRONG = {
     "an image": (edgeperc.ImageError, edgeperc.read_image),
     "a calibration": (edgeperc.CalibrationError, lambda given: edgeperc.Calibration.from_kitti(given, 9, 9)),
@@ -98,15 +102,29 @@ WRONG = {
     "scans": (edgeperc.PointsError, lambda given: next(edgeperc.accumulate(given, 0.1))),
     "a perceiver": (edgeperc.OptionError, lambda given: edgeperc.stream([], given)),
     "a tracker": (edgeperc.OptionError, lambda given: edgeperc.stream([], print, given)),
+    "tracks": (edgeperc.TrackingError, edgeperc.smooth_tracks),
+    "boxes": (edgeperc.OptionError, lambda given: edgeperc.free_ahead(NO_ROAD, given)),
+    "rules": (edgeperc.OptionError, lambda given: edgeperc.Perceiver(agree=given)),
+    "a choice": (edgeperc.OptionError, lambda given: edgeperc.Perceiver(adapt=given)),
+    "the text of a card": (edgeperc.CardError, edgeperc.ModelCard.from_json),
+    "the text of a sensor": (edgeperc.SensorError, edgeperc.SensorProfile.from_json),
 }
+PATHS = ("an image", "a calibration", "a mounting", "poses", "a card", "a sensor", "a file", "a picture")
 
 
 @pytest.mark.parametrize("what", WRONG)
 @pytest.mark.parametrize("given", [7, 1.5, np.array(0.5), np.zeros(3)], ids=["int", "float", "one", "array"])
 def test_what_is_of_another_type_is_a_typed_error(what: str, given: Any) -> None:
     error, take = WRONG[what]
-    with pytest.raises(error, match=r"expected|no sensor"):
+    with pytest.raises(error, match=r"expected|no sensor|is not JSON"):
         take(given)
+
+
+@pytest.mark.parametrize("what", PATHS)
+def test_a_null_character_in_a_path_is_a_typed_error(what: str) -> None:
+    error, take = WRONG[what]
+    with pytest.raises(error):
+        take(Path("a\0b.json"))
 
 
 def test_the_version_is_the_changelogs_newest() -> None:

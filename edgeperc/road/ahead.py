@@ -11,7 +11,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -279,8 +279,8 @@ def _standing(top_view: TopView, boxes: Iterable[Box | Track]) -> tuple[Box, ...
     """Boxes and those of tracks in the frame of the cells. OptionError for what is no top view."""
     if not isinstance(top_view, TopView):
         raise OptionError(f"got a {type(top_view).__name__} for top_view; pass perception.require_top_view()")
-    given: Iterable[Any] = [getattr(each, "box", each) for each in boxes] if isinstance(boxes, Iterable) else boxes
-    return ModelFrame(top_view.mounting).move_boxes(given)
+    given = OPTIONS.iterator("boxes", boxes, "Box objects or tracks")
+    return ModelFrame(top_view.mounting).move_boxes([getattr(each, "box", each) for each in given])
 
 
 def _objects(top_view: TopView, standing: Sequence[Box]) -> Mask:

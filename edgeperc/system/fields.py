@@ -36,7 +36,7 @@ class Fields:
         """Parse an object whose entry ``schema`` is the one that this version reads."""
         try:
             document = json.loads(text)
-        except (RecursionError, ValueError) as exc:
+        except (RecursionError, TypeError, ValueError) as exc:
             raise self.error(f"{self.what} is not JSON ({exc}); {self.advice}") from exc
         given = document.get("schema") if isinstance(document, dict) else None
         if type(given) is not int or given != schema:
@@ -66,8 +66,10 @@ class Fields:
             self.refuse(name, values, expected)
 
     def path(self, name: str, value: Any) -> Path:
-        """A path."""
-        return Path(value) if isinstance(value, str | os.PathLike) else self.refuse(name, value, "a path")
+        """A path that a file may have."""
+        if not isinstance(value, str | os.PathLike):
+            self.refuse(name, value, "a path")
+        return Path(value) if "\0" not in str(value) else self.refuse(name, value, "a path without a null character")
 
     def number(self, name: str, value: Any, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:
         """A finite number from ``low`` to ``high``."""

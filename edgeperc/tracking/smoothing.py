@@ -8,11 +8,14 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..errors import TrackingError
+from ..system.fields import Fields
 from ..types.points import Ints64, Records
 from .lives import MOST_MOVED, TRACK, mark_rivals
 from .tracker import SHAPE_WALK_M, combine, mix, predict
 from .tracks import Tracks, strength_of
 from .ukf import fill_crosses
+
+_TRACKS = Fields("the recording", TrackingError)
 
 
 def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
@@ -44,9 +47,11 @@ def smooth_tracks(recording: Iterable[Tracks]) -> list[Tracks]:
     >>> for tracks in smooth_tracks(online):                           # doctest: +SKIP
     ...     print(tracks.stamp_s, [track.box for track in tracks])
     """
-    answers = list(recording) if isinstance(recording, Iterable) else [recording]
+    answers = [*_TRACKS.iterator("recording", recording, "what a Tracker returned for each scan, as it was")]
     if not all(isinstance(tracks, Tracks) and len(tracks.every) >= len(tracks) for tracks in answers):
-        raise TrackingError("got no Tracks, or smoothed ones; pass what a Tracker returned for each scan, as it was")
+        raise TrackingError(
+            "got no Tracks, or smoothed ones; expected what a Tracker returned for each scan, as it was"
+        )
     smoothed = list(answers)
     reported = np.unique(np.concatenate([np.zeros(0, np.int64), *(tracks.ids for tracks in answers)]))
     for session in {tracks.session for tracks in answers if not tracks.is_late}:

@@ -459,7 +459,7 @@ class ModelCard:
         CardError
             Not JSON, another schema, or a key that is missing, of another type or out of its bounds.
         """
-        if len(text) > MAX_CHARACTERS:
+        if isinstance(text, str | bytes) and len(text) > MAX_CHARACTERS:
             raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
         document, known = FIELDS.document(text, SCHEMA), replace(FIELDS, exact=exact)
         _check_tree(document)

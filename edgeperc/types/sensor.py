@@ -627,10 +627,10 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     if isinstance(sensor, os.PathLike) or (isinstance(sensor, str) and sensor.endswith(".json")):
         try:
             return SensorProfile.from_json(Path(sensor).read_text(encoding="utf-8-sig"))
-        except (OSError, UnicodeDecodeError) as exc:
-            raise SensorError(f"{os.fspath(sensor)}: the sensor profile cannot be read ({exc})") from exc
         except SensorError as exc:
             raise SensorError(f"{os.fspath(sensor)}: {exc}") from exc
+        except (OSError, ValueError) as exc:  # ValueError: of what is no UTF-8, and of a null character in the path
+            raise SensorError(f"{os.fspath(sensor)!r}: the sensor profile cannot be read ({exc})") from exc
     try:
         return SENSORS[sensor] if sensor in SENSORS else PUBLIC_SENSORS[sensor]
     except (KeyError, TypeError):
