@@ -15,6 +15,7 @@ from edgeperc.cli.arguments import Options, count, keywords, options, positive, 
 from edgeperc.cli.output import make_places, print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import CardError, CardMismatchError, EdgepercError, MissingExtraError, ModelError, OptionError
+from edgeperc.system.atomic import write_atomic
 from edgeperc.types.choices import PLACES
 
 from .database.cli import add_database_commands
@@ -561,7 +562,7 @@ def _ablate_camvid(args: argparse.Namespace) -> None:
     width, height = args.size
     how = keywords(args, "epochs", "batch", "learning_rate", networks="variant", compiled="compile")
     rows = ablate_camvid(args.camvid, args.out, width=width, height=height, n_threads=args.threads, **how)
-    (args.out / "camvid.md").write_text(table(rows))
+    write_atomic(args.out / "camvid.md", table(rows).encode())
     for line in table(rows).splitlines():
         print_line(line)
     if not args.no_plots:
@@ -598,8 +599,8 @@ def _add_models(command: Command) -> None:
 def _models(args: argparse.Namespace) -> None:
     from .release.models_page import models_page, sums_of
 
-    (args.folder / "MODELS.md").write_text(models_page(args.folder))
-    (args.folder / "SHA256SUMS").write_text(sums_of(args.folder))
+    write_atomic(args.folder / "MODELS.md", models_page(args.folder).encode())
+    write_atomic(args.folder / "SHA256SUMS", sums_of(args.folder).encode())
 
 
 if __name__ == "__main__":

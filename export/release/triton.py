@@ -6,7 +6,6 @@ Triton run the networks, and returns the labels and the record that ``edgeperc r
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,7 +23,7 @@ PIPELINE = "edgeperc"
 
 def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, sensor: str = "hdl-64e") -> list[Path]:
     """Write a model repository for networks of scans (a name stands for its fp32 file) and a built-in sensor; models of
-    the same names in it are replaced. Returns their folders. Raises ModelError, SensorError.
+    the same names in it are replaced, each file as a whole. Returns their folders. Raises ModelError, SensorError.
     """
     name = get_sensor(sensor).name
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]
@@ -39,15 +38,18 @@ def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, senso
         views.remove(card.view.kind)
     version = out / PIPELINE / "1"
     version.mkdir(parents=True, exist_ok=True)
-    for old in version.glob("*.onnx"):
-        old.unlink()
-    for card, path in files:
+    # For their cards, and where the networks' inputs are made
+    copies = [version / f"{card.name}.onnx" for card, _ in files]
+    for (card, path), copy in zip(files, copies, strict=True):
+        content = path.read_bytes()
         (out / card.name / "1").mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, out / card.name / "1" / "model.onnx")
-        shutil.copyfile(path, version / f"{card.name}.onnx")  # its card, and where the networks' inputs are made
+        write_atomic(out / card.name / "1" / "model.onnx", content)
+        write_atomic(copy, content)
         write_atomic(out / card.name / "config.pbtxt", _network_config(card).encode())
-    shutil.copyfile(triton_model.__file__, version / "model.py")
+    write_atomic(version / "model.py", Path(triton_model.__file__).read_bytes())
     write_atomic(out / PIPELINE / "config.pbtxt", _pipeline_config([card for card, _ in files], name).encode())
+    for old in {*version.glob("*.onnx")} - {*copies}:
+        old.unlink()
     return [out / each for each in (*(card.name for card, _ in files), PIPELINE)]
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -155,6 +158,20 @@ def test_what_is_written(repository: Path, tmp_path: Path) -> None:
     assert "vlp-16" in text
     assert '"cells"' not in text
     assert [path.name for path in (repository_of_one / "edgeperc" / "1").glob("*.onnx")] == ["pointseg.onnx"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such limit")
+def test_a_full_disk_leaves_a_repository_as_it_was(repository: Path, tmp_path: Path) -> None:
+    """The pipeline had lost its networks, and one of them was cut off."""
+    shutil.copytree(repository, tmp_path, dirs_exist_ok=True)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.onnx")}
+    code = (
+        "import resource, sys; from pathlib import Path; from edgeperc_export.release.triton import write_repository;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)); write_repository(Path(sys.argv[1]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
+    assert "File too large" in done.stderr
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.onnx*")} == before
 
 
 def test_what_is_refused(tmp_path: Path) -> None:
