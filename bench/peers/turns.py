@@ -122,7 +122,7 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
         while connection.recv() == "turn":
             calls[-1]()
             connection.send(("took", [round(elapsed_ms(call), 4) for call in calls], rss_mb()))
-    except EOFError:
+    except (EOFError, ConnectionError):
         return  # the parent has ended
     except Exception as exc:  # the libraries' errors share no base but Exception
         connection.send(("failed", f"{type(exc).__name__}: {' '.join(str(exc).split())[:160]}", 0.0))

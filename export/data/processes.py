@@ -18,9 +18,15 @@ CONTEXT = "fork" if sys.platform == "linux" else "spawn"
 
 @contextmanager
 def mapped(function: Callable[[Item], Result], items: Iterable[Item], n_workers: int) -> Iterator[Iterator[Result]]:
-    """``map(function, items)`` in ``n_workers`` processes, in the order of the items; with 0 in this process."""
+    """``map(function, items)`` in ``n_workers`` processes, in the order of the items; with 0 in this process. After an
+    error or a signal, items that no process has taken are left.
+    """
     if not n_workers:
         yield map(function, items)
         return
     with ProcessPoolExecutor(n_workers, multiprocessing.get_context(CONTEXT)) as pool:
-        yield pool.map(function, items, chunksize=4)
+        try:
+            yield pool.map(function, items)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise

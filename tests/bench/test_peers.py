@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -69,6 +70,15 @@ def predict(engine: str, precision: str, scan: np.ndarray) -> Prediction:
     paths = [model_path(name) for name in NAMES]
     engines = [open_engine(engine, precision, path, 1) for path in paths]
     return NumpyPipeline([ModelCard.read(path) for path in paths], engines, get_sensor("hdl-64e"))(scan)
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError, ConnectionResetError, EOFError])
+def test_a_contender_ends_in_silence_after_its_parent(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each interrupted comparison left a traceback."""
+    monkeypatch.setattr(turns.signal, "signal", Mock())
+    gone = Mock(send=Mock(side_effect=error), recv=Mock(side_effect=EOFError))
+    turns.serve(gone, peers.Contender("", "peak", "copy"), (), "hdl-64e", 1)
+    gone.send.assert_called_once()
 
 
 def assert_agrees(right: Prediction, found: Prediction) -> None:

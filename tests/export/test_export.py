@@ -7,6 +7,7 @@ import itertools
 import json
 import re
 import shutil
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -50,6 +51,7 @@ from edgeperc_export import cards
 from edgeperc_export import make as make_module
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.data.augment import ObjectBank
+from edgeperc_export.data.processes import mapped
 from edgeperc_export.data.roads import DRAWN, drawn_roads
 from edgeperc_export.data.scan_sets import Labeled, seen_by_network
 from edgeperc_export.data.scans import LabeledScan, mirrored
@@ -251,6 +253,24 @@ def test_recent_samples_replace_the_oldest() -> None:
         expected = sorted([number, number, *([number - 1] * 2 if number else [])])
         assert sorted(labels.tolist()) == expected
         assert found[:, 0].tolist() == labels.tolist()
+
+
+def _touched(path: Path) -> None:
+    path.touch()
+    time.sleep(0.02)
+
+
+def test_workers_leave_what_they_have_not_begun_at_an_error(tmp_path: Path) -> None:
+    """A thousand scans were simulated to their end after a signal."""
+
+    def interrupted() -> None:
+        with mapped(_touched, [tmp_path / str(k) for k in range(100)], 2) as done:
+            next(done)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert 1 <= len([*tmp_path.iterdir()]) < 50
 
 
 def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: Path) -> None:
