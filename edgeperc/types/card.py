@@ -5,6 +5,7 @@ A card is stored in the model file, under one ``metadata_props`` key, so that it
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -29,6 +30,7 @@ MAX_DEPTH = 32
 MAX_TEXT = 100_000  # characters of one text of the free-form metadata
 MAX_CHANNELS = 16
 MAX_BLOCK = 16
+MAX_REMISSION_STD = 10.0
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = (
     *("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits", "objects"),
@@ -91,6 +93,12 @@ class InputSpec:
         check_text("input.name", self.name, CardError)
         FIELDS.numbers("input.mean", self.mean, None, -1e6, 1e6)
         FIELDS.numbers("input.std", self.std, None, 1e-6, 1e6)
+        for name, std in zip(self.channels, self.std, strict=True):
+            if name == "remission" and std > MAX_REMISSION_STD:
+                raise CardError(
+                    f"input.std of the remission is {std:g}; it is 0 to 1 before the division, and nearly nothing "
+                    f"after it: a network that was trained with 0 to 255 has 1/255, {1 / 255:.17g}"
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,6 +383,19 @@ class ModelCard:
                     f"box_classes {reprlib.repr(self.box_classes)} call the network's {own!r} {name!r}; expected what "
                     f"edgeperc calls each of head.classes {reprlib.repr(head.classes)}, in their order"
                 )
+        if isinstance(head, AnchorHead) and len(head.anchors) == len(head.classes):
+            ranks = {"pedestrian": 0, "cyclist": 1, **dict.fromkeys(VEHICLES, 2)}
+            known = [
+                (ranks[name], name, anchor.size_m[0])
+                for name, anchor in zip(self.box_classes, head.anchors, strict=True)
+                if name in ranks
+            ]
+            for (rank, shorter, m), (other, longer, n) in itertools.permutations(known, 2):
+                if rank < other and m > n:
+                    raise CardError(
+                        f"head.anchors have {m:g} m for a {shorter} and {n:g} m for a {longer}; expected an anchor of "
+                        "each class, in the order of head.classes"
+                    )
         n_values = view.max_pillars * view.max_points * len(self.input.channels)
         if n_values > MAX_VALUES:
             raise CardError(f"the input has {n_values} values (view.max_pillars); expected at most {MAX_VALUES}")

@@ -162,6 +162,21 @@ def test_classes_of_boxes_in_another_order_are_refused(names: list[str]) -> None
     refuse(document() | {"box_classes": names}, r"call the network's '\w+' '\w+'; expected .* head\.classes .* order")
 
 
+@pytest.mark.parametrize("order", [(2, 1, 0), (1, 0, 2), (0, 2, 1)])
+def test_anchors_in_another_order_are_refused(order: tuple[int, ...]) -> None:
+    """Cars had the size of pedestrians."""
+    given = document()
+    given["head"]["anchors"] = [given["head"]["anchors"][k] for k in order]
+    refuse(given, r"head\.anchors have [\d.]+ m for a \w+ and [\d.]+ m for a \w+; expected .* order of head\.classes")
+
+
+def test_a_remission_that_is_divided_by_255_is_refused() -> None:
+    """It is 0 to 1 already, and a network that was trained with 0 to 255 saw 0."""
+    given = document()
+    given["input"]["std"] = [1, 1, 1, 255]
+    refuse(given, r"input\.std of the remission is 255; .* has 1/255, 0\.0039215686274509803")
+
+
 def test_a_head_is_of_pillars_alone() -> None:
     given = document()
     del given["head"]
