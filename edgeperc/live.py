@@ -128,7 +128,8 @@ def stream(
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
     check_rate(rate_hz)
-    if not (callable(perceiver) and (tracker is None or callable(tracker))):
+    given = (perceiver,) if tracker is None else (perceiver, tracker)
+    if not all(callable(each) and not isinstance(each, type) for each in given):  # a class can be called, too
         told = f"perceiver is {perceiver!r:.200} and tracker {tracker!r:.200}"
         raise OptionError(f"{told}; expected a Perceiver, and a Tracker or None")
     if not all(isinstance(age_s, Real | None) for age_s in (late_after_s, stale_after_s)):

@@ -240,6 +240,13 @@ def test_a_source_that_is_none(source: Any) -> None:
         stream(source, perceive)
 
 
+def test_classes_in_place_of_what_they_make_are_refused() -> None:
+    """They were called with the scan in place of their options."""
+    for given in ((edgeperc.Perceiver,), (perceive, edgeperc.Tracker)):
+        with pytest.raises(OptionError, match=r"<class '.*'>.*; expected a Perceiver, and a Tracker or None"):
+            stream([], *given)
+
+
 @pytest.mark.parametrize(
     "given",
     [
