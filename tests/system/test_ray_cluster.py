@@ -175,7 +175,7 @@ def test_what_is_kept_was_made_after_the_same_first_scans() -> None:
 def figures(file: Path, *options: str) -> tuple[Any, list[str]]:
     """What an evaluation writes and prints."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert cli.main(["eval", "simulation:3", *options, "--json", str(file)]) == 0
+        assert cli.main(["eval", "simulation:7", *options, "--json", str(file)]) == 0
     written = json.loads(file.read_text())
     del written["command"]
     # Ray itself prints that a process of its died, which a busy computer may bring about; the block is done again.
