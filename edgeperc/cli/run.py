@@ -49,6 +49,7 @@ from .scans import (
     scan_folders,
     scan_namer,
     stated_sensor,
+    warn_of_rate,
     with_mounting,
 )
 from .side_by_side import (
@@ -244,6 +245,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     elif scans:
         check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
+    if arguments.track and not (images or arguments.live or arguments.deskew):
+        warn_of_rate(scans, arguments.rate)
     names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     check_outputs(arguments, kinds, images, scans, targets)

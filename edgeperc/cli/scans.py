@@ -181,6 +181,56 @@ def _warn_of_times(pairs: Sequence[tuple[Path, Path | Remote]]) -> None:
             return
 
 
+_SPUN_S = (0.01, 30.0)  # between two scans; what is outside is no time, as a date written in digits
+_GAP = 1.5  # times the usual step between two scans, from which on some are missing
+
+
+def warn_of_rate(scans: Iterable[Path | Remote], rate_hz: float) -> None:
+    """Warn of scan files whose names contradict that they are ``1 / rate_hz`` apart: speeds of tracks would be wrong,
+    and tracks would go on from one scene to the next. Names may count anything, so nothing is taken from them.
+    """
+    folders: dict[Path | Remote, list[Path | Remote]] = {}
+    for scan in scans:
+        if not is_recording(scan):
+            folders.setdefault(scan.parent, []).append(scan)
+    for folder, files in folders.items():
+        if contradiction := _contradiction([file.name for file in files], rate_hz):
+            warnings.warn(f"--track: {folder}: {contradiction}", stacklevel=2)
+
+
+def _contradiction(names: Sequence[str], rate_hz: float) -> str:
+    """How names contradict that scans follow one another at a rate, and what to do; empty if they do not."""
+    import numpy as np
+
+    from ..sinks.run_file import stem_of
+
+    ends = [re.search(r"\d+(\.\d+)?$", stem_of(name)[0]) for name in names]
+    words = [end[0] for end in ends if end is not None]
+    if len(words) < max(3, len(names)):
+        return ""
+    values, are_times = np.array(words, np.float64), all(map(_TIME.fullmatch, words))
+    if are_times:  # ms, us and ns have three digits more each
+        values *= [10.0 ** (-3 * (max(len(word.partition(".")[0]) - 8, 0) // 3)) for word in words]
+    elif any("." in word for word in words):
+        return ""
+    steps = np.diff(values)
+    usual = float(np.median(steps))
+    taken = f"taken as {1.0 / rate_hz:g} s apart, so that speeds would be wrong"
+    if are_times and _SPUN_S[0] < usual < _SPUN_S[1] and not 0.8 < usual * rate_hz < 1.25:
+        return f"by the times in their names, scans are {usual:.3g} s apart, and {taken}; pass --rate {1.0 / usual:.3g}"
+    is_gap = (steps > _GAP * usual) | (steps < 0.0)
+    if usual <= 0.0 or (are_times and usual < _SPUN_S[0]) or not is_gap.any():
+        return ""
+    k, n_more = int(is_gap.argmax()), int(is_gap.sum()) - 1
+    gap = f"{steps[k]:.3g} s pass" if are_times else f"{steps[k] / usual - 1.0:,.0f} scans are missing"
+    gap = f"{'times' if are_times else 'numbers'} go back" if steps[k] < 0.0 else gap
+    more = f" (and {n_more:,} more such gaps)" if n_more else ""
+    return (
+        f"by their names, {gap} between {names[k]} and {names[k + 1]}{more}. The two are {taken}, "
+        "and tracks go on; put the scans before and behind the gap into folders of their own"
+    )
+
+
 def scan_namer(path: Path) -> Callable[[int], Path]:
     """Make a function from the index of a scan in a source to a name: its file, or the capture and the index."""
     from ..readers.captures import is_capture, scan_files

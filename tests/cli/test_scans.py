@@ -1,0 +1,64 @@
+"""Which scans lie below a path, and what their names tell."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from cli_helpers import Shell, write_scan
+from edgeperc.cli.scans import warn_of_rate
+
+TOP = "n015-2018-07-24__LIDAR_TOP__{}.pcd.bin"  # as nuScenes calls them
+START_US = 1532402927647951
+
+
+def told(names: list[str], rate_hz: float = 10.0) -> str:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        warn_of_rate([Path("drive") / name for name in names], rate_hz)
+    return " ".join(str(each.message) for each in said)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ([TOP.format(START_US + 500_000 * k) for k in range(4)], "0.5 s apart, and taken as 0.1 s apart"),
+        ([TOP.format(START_US + 50_000 * k) for k in range(4)], "pass --rate 20"),
+        ([f"{1616343528200 + 500 * k}.bin" for k in range(4)], "pass --rate 2"),
+        ([f"{315966265259836000 + 200_000_000 * k}.npy" for k in range(4)], "pass --rate 5"),
+        ([f"{1700000000 + 0.05 * k:.6f}.pcd" for k in range(4)], "pass --rate 20"),
+        ([f"{1700000000 + 0.1 * k + 60 * (k > 1):.6f}.pcd" for k in range(4)], "60.1 s pass between 1700000000.1"),
+        ([f"{k:06d}.bin" for k in (0, 1, 2, 3, 7, 8, 12)], "3 scans are missing between 000003.bin and 000007.bin"),
+        ([f"a_{k}.bin" for k in range(4)] + [f"b_{k}.bin" for k in range(4)], "go back between a_3.bin and b_0.bin"),
+    ],
+)  # fmt: skip
+def test_names_that_contradict_the_rate_are_told(names: list[str], said: str) -> None:
+    assert said in told(names)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{k:010d}.bin" for k in range(4)],
+        [f"{k:06d}.bin" for k in range(0, 40, 5)],  # numbers that count something else
+        [f"{1700000000 + 0.11 * k:.6f}.pcd" for k in range(4)],
+        [f"{20180724112245 + k}.bin" for k in range(4)],  # a date
+        ["first.bin", "1.bin", "7.bin"],
+        ["1.bin", "9.bin"],
+        ["1.25.bin", "1.5.bin", "3.5.bin", "3.75.bin"],
+        ["drive.pcap", "drive_9.pcap"],
+        [],
+    ],
+)
+def test_other_names_are_not_told(names: list[str]) -> None:
+    assert told(names) == ""
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_drive_with_a_gap_is_told_where_it_is_tracked(tmp_path: Path, shell: Shell) -> None:
+    for k in (0, 1, 2, 5):
+        write_scan(tmp_path / f"{k}.bin")
+    assert "2 scans are missing between 2.bin and 5.bin" in shell.err("run", tmp_path, "--anyway", "--track", code=0)
+    assert "missing" not in shell.err("run", tmp_path, "--anyway", code=0)
