@@ -10,7 +10,7 @@ from ..errors import PointsError, SensorError
 from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_ego_box, options
 from .output import make_folder, print_rows
-from .scans import check_profile_place, find_scans, with_mounting
+from .scans import check_profile_place, find_scans, nothing_below, with_mounting
 
 _MOST_OF_PORTS = 50  # scans of a sensor that goes on sending
 
@@ -52,7 +52,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
 
     files = find_scans(arguments.scans)
     if files.empty:
-        raise PointsError(f"{files.empty[0]}: no scan in this folder; expected scans or captures")
+        raise PointsError(nothing_below(files.empty[0]))
     if arguments.out.suffix != ".json":
         raise SensorError(
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"

@@ -18,7 +18,15 @@ from ..system.printable import many
 from ..types.choices import DEFAULT_MODELS
 from .arguments import Commands, add_capture, add_command, check_inputs, options
 from .output import in_options, print_error, print_line, print_rows
-from .scans import Sensors, check_profile_place, check_scans, check_sensor, reading_options
+from .scans import (
+    Sensors,
+    check_profile_place,
+    check_scans,
+    check_sensor,
+    is_folder,
+    reading_options,
+    scan_folders,
+)
 
 if TYPE_CHECKING:
     from ..ground.leveling import MountingEstimator
@@ -59,7 +67,7 @@ def add_parser(commands: Commands) -> None:
     reading(
         "things MODEL|SCAN|IMAGE...",
         "a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
-        "first five), or an image",
+        "first five), a folder of scans or a data set's root, as for 'run', or an image",
     )
     add_capture(reading)
     reading(
@@ -81,6 +89,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..zoo import resolve
 
     check_sensor(arguments)
+    arguments.things = [below for thing in arguments.things for below in _below(thing)]
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     if arguments.write is not None:
@@ -186,6 +195,13 @@ def _is_model(thing: str) -> bool:
     path = Path(thing)
     is_scan = path.exists() or path.suffix or len(path.parts) > 1 or is_port(path)
     return path.suffix == ".onnx" or not is_scan
+
+
+def _below(thing: str) -> list[str]:
+    """The folders of scans of a data set's root; anything else is as it is given."""
+    if _is_model(thing) or not is_folder(Path(thing)):
+        return [thing]
+    return [*map(str, scan_folders(Path(thing)))] or [thing]
 
 
 def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tuple[str, str]]:

@@ -44,6 +44,7 @@ from .scans import (
     find_images,
     find_scans,
     is_folder,
+    nothing_below,
     output_names,
     reading_options,
     scan_folders,
@@ -105,7 +106,8 @@ def add_parser(commands: Commands) -> None:
     reading(
         "paths PATH...",
         "scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
-        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .pcapng, .osf, .bag, .mcap, a ROS 2 bag's folder "
+        "SemanticKITTI, of KITTI raw drives, nuScenes (key frames), View of Delft or ONCE; captures: .pcap, .pcapng, "
+        ".osf, .bag, .mcap, a ROS 2 bag's folder "
         "(extras 'velodyne', 'bags', and 'ouster' for .osf); ports to which a sensor sends its packets (udp:2368); or "
         "images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra 'camera')",
         type=location,
@@ -261,10 +263,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     make_places(arguments.mcap, arguments.rrd, arguments.play, arguments.consistency, gif)
     report = Report(arguments, images)
     for folder in found.empty:
-        has_tables = isinstance(folder, Path) and any(folder.glob("*.csv"))
-        tables = f"; pass tables of text by name: {folder}/*.csv" if has_tables else ""
-        nothing = f"no scan in this folder; expected scans, captures or a ROS 2 bag's folder{tables}"
-        report.add(folder, PointsError(nothing))
+        report.add(folder, PointsError(nothing_below(folder)))
     started = time.perf_counter()
     of_ports, ended = any(map(is_port, scans)), None
     sinks = Sinks(arguments, of_ports=of_ports)

@@ -28,10 +28,16 @@ if TYPE_CHECKING:
     from ..types.sensor import SensorProfile
 
 
-# Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
+# Folders of scans in data sets, from their roots and folders below.
 _LAYOUTS = (
-    *("training/velodyne", "training/velodyne/*", "testing/velodyne", "testing/velodyne/*", "sequences/*/velodyne"),
-    *("velodyne", "velodyne/*", "velodyne_points/data", "*/velodyne_points/data"),
+    # KITTI object and tracking; SemanticKITTI
+    *("training/velodyne", "training/velodyne/*", "testing/velodyne", "testing/velodyne/*"),
+    *("sequences/*/velodyne", "velodyne", "velodyne/*", "*/velodyne"),
+    # KITTI raw drives: one, those of a day, those of several days; KITTI-360
+    *("data", "velodyne_points/data", "*/velodyne_points/data", "*/*/velodyne_points/data"),
+    "data_3d_raw/*/velodyne_points/data",
+    # nuScenes' key frames, View of Delft, ONCE
+    *("samples/LIDAR_TOP", "LIDAR_TOP", "lidar/training/velodyne", "lidar/testing/velodyne", "data/*/lidar_roof"),
 )
 # Folder names of these layouts that do not identify a scan.
 _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
@@ -52,8 +58,17 @@ def scan_folders(root: Path) -> list[Path]:
 
     if scan_files(root):
         return [root]
-    folders = (folder for layout in _LAYOUTS for folder in sorted(root.glob(layout)))
+    folders = dict.fromkeys(folder for layout in _LAYOUTS for folder in sorted(root.glob(layout)))
     return [folder for folder in folders if folder.is_dir() and scan_files(folder)]
+
+
+def nothing_below(folder: Path | Remote) -> str:
+    """What to say of a folder without scans."""
+    from ..readers.captures import nothing_in
+
+    if isinstance(folder, Remote):
+        return f"{folder}: no scan in this folder; expected scans or captures"
+    return f"{nothing_in(folder)}. Nor is it the root of a data set that 'edgeperc run --help' lists"
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:

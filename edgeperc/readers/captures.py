@@ -270,6 +270,33 @@ def scan_files(folder: Path) -> list[Path]:
         return sorted(entries, key=by_number)
 
 
+def nothing_in(folder: Path) -> str:
+    """What to say of a folder without scans, and of what there is in it instead."""
+    nothing = (
+        f"{folder}: no scan in this folder; expected {', '.join(SCAN_SUFFIXES + CAPTURE_SUFFIXES)}, or a ROS 2 bag's "
+        "metadata.yaml"
+    )
+    files = sorted((entry for entry in folder.glob("[!._]*.*") if entry.is_file()), key=by_number)
+    tables = next((file.suffix for file in files if file.suffix.lower() in _TABLE_SUFFIXES), None)
+    if tables is not None:
+        return f"{nothing}; pass tables of text by name: {folder}/*{tables}"
+    for file in files[:_LOOKED_AT]:
+        with _reading(file):
+            advice = advice_for(_head(file))
+        if advice is not None:
+            return f"{nothing}; {file.name} is {advice}"
+    return nothing
+
+
+_TABLE_SUFFIXES = (
+    ".csv",
+    ".xyz",
+    ".pts",
+    ".txt",
+)  # many others have these names, so that those of a folder are not read
+_LOOKED_AT = 10
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Raise `PointsError` where the system refuses: a file or folder of others, or a name that is too long."""
@@ -313,9 +340,6 @@ def _head(path: Path) -> bytes:
 def _folder(folder: Path, options: _Options) -> Iterator[TimedScan]:
     files = scan_files(folder)
     if not files:
-        raise PointsError(
-            f"{folder}: no scan in this folder; expected {', '.join(SCAN_SUFFIXES + CAPTURE_SUFFIXES)}, or a ROS 2 "
-            "bag's metadata.yaml"
-        )
+        raise PointsError(nothing_in(folder))
     for file in files:
         yield from _scans(file, options)

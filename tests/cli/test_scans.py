@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
 import pytest
 
 from cli_helpers import Shell, write_scan
-from edgeperc.cli.scans import warn_of_rate
+from edgeperc import PointsError, read_scans
+from edgeperc.cli.scans import find_scans, warn_of_rate
 
 TOP = "n015-2018-07-24__LIDAR_TOP__{}.pcd.bin"  # as nuScenes calls them
 START_US = 1532402927647951
@@ -62,3 +64,49 @@ def test_a_drive_with_a_gap_is_told_where_it_is_tracked(tmp_path: Path, shell: S
         write_scan(tmp_path / f"{k}.bin")
     assert "2 scans are missing between 2.bin and 5.bin" in shell.err("run", tmp_path, "--anyway", "--track", code=0)
     assert "missing" not in shell.err("run", tmp_path, "--anyway", code=0)
+
+
+@pytest.mark.parametrize(
+    "below",
+    [
+        "training/velodyne",
+        "sequences/00/velodyne",
+        "00/velodyne",  # of sequences/
+        "data",  # of velodyne_points/
+        "velodyne_points/data",
+        "2011_09_26_drive_0001_sync/velodyne_points/data",
+        "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data",
+        "data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data",
+        "samples/LIDAR_TOP",
+        "LIDAR_TOP",
+        "lidar/training/velodyne",
+        "data/000076/lidar_roof",
+    ],
+)
+def test_the_root_of_a_data_set_is_read(below: str, tmp_path: Path, shell: Shell) -> None:
+    scan = write_scan(tmp_path / below / "0000000000.bin")
+    assert find_scans([tmp_path]).paths == [scan]
+    (answer,) = shell.records("info", tmp_path, "--sensor", "hdl-64e", code=1)  # of 40 points
+    assert answer["scan"] == str(scan.parent)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.csv", b"x,y,z\n1,2,3\n", "/*.csv"),
+        ("a.TXT", b"1 2 3\n", "/*.TXT"),
+        ("1.feather", b"ARROW1\0\0", "1.feather is a Feather (Arrow) table"),
+        ("00.pkl.gz", b"\x1f\x8b\x08\x00", "00.pkl.gz is "),
+        ("a.las", b"LASF", "pdal translate"),
+    ],
+)
+def test_a_folder_without_scans_says_what_is_in_it(
+    name: str, content: bytes, said: str, tmp_path: Path, shell: Shell
+) -> None:
+    (tmp_path / ".hidden.pkl").write_bytes(b"\x80\x04")
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(PointsError, match=r"no scan in this folder.*" + re.escape(said)):
+        next(read_scans(tmp_path))
+    for command in ("run", "info"):
+        assert said in shell.err(command, tmp_path, code=1)
+    assert said in shell.err("fit-sensor", tmp_path, "--sensor", "hdl-64e", "--out", tmp_path / "a.json", code=2)
