@@ -100,7 +100,7 @@ FLOORS = {
         view.files view.page view.picture view.tracks
         view.painted
         view.__init__
-        datasets.__init__ datasets.annotations datasets.images datasets.splits
+        datasets.__init__ datasets.annotations datasets.images datasets.pickled datasets.splits
         datasets.kitti datasets.layout
         datasets.trees
         datasets.scan_folder

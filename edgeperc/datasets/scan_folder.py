@@ -217,7 +217,8 @@ class ScanFolder:
         if self.layout.files in TREES and (self.root / "velodyne").is_dir():
             self.layout = replace(self.layout, files="plain")
         if self.layout.files in TREES:
-            self._tree, self._names_file = TREES[self.layout.files](self.root), "category.json"
+            self._tree = TREES[self.layout.files](self.root)
+            self._names_file = self._tree.names_file
             self.scans, self.drives = self._tree.scans, self._tree.drives
         else:
             self.scans = self._scans()

@@ -1,4 +1,4 @@
-"""Public sets as they are downloaded: nuScenes' tables, and Argoverse 2's logs."""
+"""Public sets as they are downloaded: nuScenes' tables, Argoverse 2's logs, and PandaSet's sequences."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from ..types.points import Floats, Points
 from .annotations import read_json
 from .kitti import read_numbers
 from .layout import WITH_RIDER, point_names_of
+from .pickled import read_pickled
 
 _Row = TypeVar("_Row")
 _Json = dict[str, Any]
@@ -48,6 +49,7 @@ class Tree:
     scans: dict[str, Path]
     drives: dict[str, str]
     point_names: Mapping[int, str]
+    names_file = "category.json"  # of ``point_names``
 
     def read(self, name: str) -> Labeled:
         """Read a scan and its labels. Raises PointsError."""
@@ -263,6 +265,77 @@ def _log(folder: Path) -> _Log:
     return _Log(np.array([sensors[axis][names.index("up_lidar")] for axis in _PLACE], np.float64), boxes, egos, areas)
 
 
+class PandaSet(Tree):
+    """The labeled scans of PandaSet (Xiao et al., 2021), in ``ROOT/SEQ``: the points of the Pandar64, and the boxes of
+    what it sees. The origin is that of the vehicle's pose.
+    """
+
+    names_file = "annotations/semseg/classes.json"
+
+    def __init__(self, root: Path) -> None:
+        files = {
+            f"{path.parents[1].name}_{path.name.partition('.')[0]}": path
+            for depth in ("", "*/")
+            for path in sorted(root.absolute().glob(f"{depth}lidar/[0-9]*.pkl.gz"))
+        }
+        self.scans = {name: path for name, path in files.items() if any(map(Path.is_file, _annotations(path)))}
+        if not self.scans:
+            labels = "SEQ/annotations/cuboids/00.pkl.gz or semseg/00.pkl.gz"
+            raise PointsError(f"{root} has no labeled scans of PandaSet; expected SEQ/lidar/00.pkl.gz and {labels}")
+        self.drives = {name: f"pandaset_{path.parents[1].name}" for name, path in self.scans.items()}
+        named = (path.parents[1] / self.names_file for path in self.scans.values())
+        file = next(filter(Path.is_file, named), None)
+        self.point_names = {} if file is None else point_names_of(read_json(file), str(file))
+        self._poses = lru_cache(maxsize=2)(lambda path: read_json(path, list))
+
+    def read(self, name: str) -> Labeled:
+        """Read a scan from the world's frame, and its labels. Raises PointsError."""
+        path = self.scans[name]
+        boxes_of, classes_of = _annotations(path)
+        boxes = numbers = None
+        try:
+            pose = self._poses(path.with_name("poses.json"))[int(path.name.partition(".")[0])]
+            place, turn = ([pose[of][axis] for axis in axes] for of, axes in (("position", "xyz"), ("heading", "wxyz")))
+            into = _RIGHT_TO_AHEAD @ np.linalg.inv(_pose(place, turn))
+            table = read_pickled(path)
+            of_lidar = table["d"] == _PANDAR64
+            xyz, intensity = np.column_stack([table[axis] for axis in "xyz"])[of_lidar], table["i"][of_lidar]
+            points = np.column_stack([xyz @ into[:3, :3].T + into[:3, 3], intensity]).astype(np.float32)
+            if boxes_of.is_file():
+                boxes = _cuboids(read_pickled(boxes_of), into)
+            if classes_of.is_file():
+                numbers = read_pickled(classes_of)["class"]
+                if len(numbers) != len(of_lidar):
+                    raise ValueError(f"{len(numbers)} classes for {len(of_lidar)} points")
+                numbers = numbers[of_lidar].astype(np.uint64)
+        except PointsError:
+            raise
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
+            raise PointsError(f"{path}, its labels or its poses.json are not as PandaSet's ({exc!r:.100})") from exc
+        return Labeled(points, boxes, numbers, None)
+
+
+def _annotations(scan: Path) -> tuple[Path, Path]:
+    """The files of PandaSet with the boxes of a scan and the classes of its points."""
+    folder = scan.parents[1] / "annotations"
+    return folder / "cuboids" / scan.name, folder / "semseg" / scan.name
+
+
+def _cuboids(table: Mapping[str, NDArray[Any]], into: Floats) -> list[Box]:
+    """PandaSet's boxes, whose length is along y; one that both LiDARs see has a row of each."""
+    boxes = []
+    for k in np.flatnonzero(table["cuboids.sensor_id"] != _PANDARGT).tolist():
+        place, size = ([table[f"{of}.{axis}"][k] for axis in "xyz"] for of in ("position", "dimensions"))
+        half = 0.5 * (float(table["yaw"][k]) + 0.5 * math.pi)
+        pose = _pose(place, (math.cos(half), 0.0, 0.0, math.sin(half)))
+        boxes.append(_box(_text(table["label"][k]).replace(" ", "_"), pose, size, into))
+    return boxes
+
+
+_PANDAR64, _PANDARGT = 0, 1  # sensors of PandaSet
+_RIGHT_TO_AHEAD = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
 def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
     """Columns of a table. Raises PointsError."""
     arrow = require("pyarrow", "argoverse", f"{path}: a Feather file")
@@ -343,5 +416,5 @@ def _box(kind: str, pose: Floats, size: Iterable[float], into: Floats) -> Box:
     return Box(kind, 1.0, (x, y, z), (length, width, height), math.atan2(there[1, 0], there[0, 0]))
 
 
-TREES: Mapping[str, Callable[[Path], Tree]] = {"nuscenes": NuScenes, "argoverse2": Argoverse2}
+TREES: Mapping[str, Callable[[Path], Tree]] = {"nuscenes": NuScenes, "argoverse2": Argoverse2, "pandaset": PandaSet}
 """What reads a set in its own tree, by ``files`` of its description."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..agreement.rules import RULES
 from ..datasets.kitti import Frame, KittiObjects, RoadFrame, scan_hash
-from ..datasets.layout import COARSE, IGNORED, box_label, class_number
+from ..datasets.layout import COARSE, IGNORED, box_label, class_number, known_layouts
 from ..datasets.scan_folder import ScanFolder, ScanFrame
 from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
@@ -172,7 +172,8 @@ class Judge:
         """Truth and perception of a scan in the frame of the models, and its boxes in that of the scan; as a user's,
         its mounting is that of its drive. Raises SplitError.
         """
-        check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
+        known_as = f"{frame.layout.name}/{frame.name}" if frame.layout.name in known_layouts() else ""
+        check_unseen(self.trained_on, frame.name, frame.drive, frame.points, known_as)
         if frame.drive != self.drive:
             self.perceive.reset_mounting()
             self.drive = frame.drive
@@ -414,16 +415,23 @@ def check_scans(scans: ScanFolder | KittiObjects, sensor: SensorProfile | None, 
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
-    """Read from cards the `scan_hash` of every real training scan, by name and version of the model."""
+    """Read from cards the `scan_hash` of every real training scan, and the names (SET/NAME) of those of other sets than
+    KITTI, by name and version of the model.
+    """
     frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
-    return {name: set(hashes.values()) if isinstance(hashes, Mapping) else set() for name, hashes in frames.items()}
+    return {
+        model: {*hashes.values(), *(name for name in hashes if "/" in name)} if isinstance(hashes, Mapping) else set()
+        for model, hashes in frames.items()
+    }
 
 
-def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: Points) -> None:
-    """Raise `SplitError` if one of the models was trained on this scan (see `training_scans_of`)."""
-    digest = scan_hash(points)
+def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: Points, known_as: str = "") -> None:
+    """Raise `SplitError` if one of the models was trained on this scan (see `training_scans_of`), or on a copy whose
+    values were rounded, of a public set that knows it by a name.
+    """
+    seen = {scan_hash(points), known_as}
     for model, hashes in trained_on.items():
-        if digest in hashes:
+        if not hashes.isdisjoint(seen):
             raise SplitError(
                 f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate drives "
                 "that were held back, or models trained without this drive (--model), or, with 'edgeperc eval', split "

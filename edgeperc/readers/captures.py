@@ -282,7 +282,7 @@ def nothing_in(folder: Path) -> str:
         return f"{nothing}; pass tables of text by name: {folder}/*{tables}"
     for file in files[:_LOOKED_AT]:
         with _reading(file):
-            advice = advice_for(_head(file))
+            advice = advice_for(_head(file), file.name)
         if advice is not None:
             return f"{nothing}; {file.name} is {advice}"
     return nothing

@@ -219,7 +219,7 @@ def _parse(data: Bytes, name: str, options: FileOptions) -> _Read:
         return _of_named(parse_pcd(data, head, options.remission_field), options)
     # The first bytes of float32 values may be any, but thousands of them are no text.
     may_be_raw = options.columns is not None or (name.endswith(".bin") and not begins_like_text(head))
-    advice = None if may_be_raw else advice_for(head)
+    advice = None if may_be_raw else advice_for(head, name)
     if advice is not None:
         raise PointsError(f"this is {advice}")
     if begins_like_text(head) and not name.endswith(".bin"):

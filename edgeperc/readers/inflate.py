@@ -29,7 +29,7 @@ def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
     limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":
         content = packed
-    elif method in ("deflate", "bz2", "lz4", "zstd"):
+    elif method in ("deflate", "gzip", "bz2", "lz4", "zstd"):
         try:
             content = _decompressor(method)(packed, limit + 1)
         except (PointsError, ImportError, MemoryError):
@@ -74,6 +74,8 @@ def _decompressor(method: str) -> Any:
     """A function from the compressed bytes and a number to at most so many bytes."""
     if method == "deflate":
         return zlib.decompressobj(-15).decompress
+    if method == "gzip":
+        return zlib.decompressobj(31).decompress
     if method == "bz2":  # several streams may follow one another, as parallel compressors write them
         return lambda packed, most: _in_pieces(bz2.BZ2File(io.BytesIO(packed)).read, most)
     if method == "lz4":

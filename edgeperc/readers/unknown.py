@@ -30,8 +30,13 @@ _KNOWN: dict[bytes | tuple[bytes, ...], str] = {
 }
 
 
-def advice_for(head: bytes) -> str | None:
+def advice_for(head: bytes, name: str = "") -> str | None:
     """What a file of another format is, and what to do; None if its first bytes are not known."""
+    if head.startswith(b"\x1f\x8b") and name.lower().endswith(".pkl.gz"):
+        return (
+            "a pickle in gzip; of PandaSet, edgeperc eval ROOT:pandaset reads it, and docs/howto/train.md has lines "
+            "that make .bin files of its scans; others are never unpickled: save the points as .npy"
+        )
     if head[4:8] == b"ftyp":
         return _FILM
     if head[257:262] == b"ustar":

@@ -96,7 +96,7 @@ def test_the_root_of_a_data_set_is_read(below: str, tmp_path: Path, shell: Shell
         ("a.csv", b"x,y,z\n1,2,3\n", "/*.csv"),
         ("a.TXT", b"1 2 3\n", "/*.TXT"),
         ("1.feather", b"ARROW1\0\0", "1.feather is a Feather (Arrow) table"),
-        ("00.pkl.gz", b"\x1f\x8b\x08\x00", "00.pkl.gz is "),
+        ("00.pkl.gz", b"\x1f\x8b\x08\x00", "edgeperc eval ROOT:pandaset reads it"),
         ("a.las", b"LASF", "pdal translate"),
     ],
 )

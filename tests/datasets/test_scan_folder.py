@@ -312,7 +312,7 @@ def test_folders_without_scans_labels_or_description(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match=r"no scans\.json.*FOLDER:pandaset"):
         ScanFolder(tmp_path)
     with pytest.raises(PointsError, match="no scans; expected velodyne/NAME"):
-        ScanFolder(tmp_path, "pandaset")
+        ScanFolder(tmp_path, "vod")
     with pytest.raises(PointsError, match="no labels for its scans"):
         ScanFolder(folder_of(tmp_path))
     with pytest.raises(PointsError, match="no layout 'pandar'"):
