@@ -450,6 +450,12 @@ def check_sensor(arguments: argparse.Namespace) -> None:
 
     get_sensor(with_mounting(stated_sensor(arguments), arguments))
     file, given = getattr(arguments, "extrinsic", None), _given(arguments)
+    if arguments.sensor == "nuscenes" and file is None and getattr(arguments, "turn", None) is None:
+        warnings.warn(
+            "--sensor nuscenes: as published, x of nuScenes' scans points to the right, and x is taken for ahead; pass "
+            "--turn -90, or --turn 0 for scans that were turned",
+            stacklevel=2,
+        )
     if file is None or not given:
         return
     said = Mounting.from_file(file)

@@ -110,3 +110,11 @@ def test_a_folder_without_scans_says_what_is_in_it(
     for command in ("run", "info"):
         assert said in shell.err(command, tmp_path, code=1)
     assert said in shell.err("fit-sensor", tmp_path, "--sensor", "hdl-64e", "--out", tmp_path / "a.json", code=2)
+
+
+@pytest.mark.filterwarnings("default")
+def test_the_direction_of_nuscenes_is_asked_for(tmp_path: Path, shell: Shell) -> None:
+    scan = write_scan(tmp_path / "0.pcd.bin")
+    assert "pass --turn -90" in shell.err("run", scan, "--sensor", "nuscenes", "--anyway", code=0)
+    for turn in ("-90", "0", "street"):
+        assert "--turn -90" not in shell.err("run", scan, "--sensor", "nuscenes", f"--turn={turn}", "--anyway", code=0)
