@@ -316,10 +316,12 @@ class ScanFolder:
         files = {name: [self._path(kind, name) for kind in ("boxes", "points", "drivable")] for name in self.scans}
         labeled = [name for name, paths in files.items() if any(paths)]
         if not labeled:
-            raise PointsError(
-                f"{self.root} has no labels for its scans ({next(iter(self.scans))}, ...); expected label/NAME.txt, "
-                "semseg/NAME.u8 or drivable/NAME.json (with box_format kitti: label_2/NAME.txt and calib/NAME.txt)"
-            )
+            expected = "label/NAME.txt, semseg/NAME.u8 or drivable/NAME.json (with box_format kitti: label_2/NAME.txt "
+            expected += "and calib/NAME.txt)"
+            if self.layout.files == "semantickitti":
+                expected = "sequences/SEQ/labels/NAME.label, with the same NAMEs as in velodyne/"
+            some = next(iter(self.scans))
+            raise PointsError(f"{self.root} has no labels for its scans ({some}, ...); expected {expected}")
         read = {path for paths in files.values() for path in paths if path}
         places = {path.parent for path in read} | {self.root / name for name in LABEL_FOLDERS}
         if unread := {path for folder in places for path in folder.glob("[!._]*")} - read:

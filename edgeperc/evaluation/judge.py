@@ -46,7 +46,7 @@ from .tables import ALL_ROUND, BANDS, SITTING, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
-_DRIVES_CHECKED = 10  # by `check_scans`
+_SCANS_CHECKED = 10  # by `check_scans`
 _NEAR_M = 20.0
 _MOST_EMPTY = 0.25  # of near boxes; 0 of the labels of six sets, 45 to 75 % of those of their next drive
 
@@ -391,11 +391,12 @@ def renamed(labels: Labels, names: Sequence[str], classes: Sequence[str]) -> Byt
 
 def check_scans(scans: ScanFolder | KittiObjects, sensor: SensorProfile | None, names: Sequence[str]) -> None:
     """Warn if the first scans of drives have remission in another unit than the sensor's, or labeled boxes in which
-    nothing stands, as those of another scan: figures would be worse. Of a few drives, as these scans are read again.
+    nothing stands, as those of another scan: figures would be worse. Of a few drives, or of few drives a few scans, as
+    these scans are read again.
     """
     first = [*{scans.drives[name]: name for name in reversed(names)}.values()]
-    some = first[:: math.ceil(len(first) / _DRIVES_CHECKED)] if first else []
-    frames = [scans.frame(name) for name in some]
+    some = first if len(first) >= _SCANS_CHECKED else names
+    frames = [scans.frame(name) for name in some[:: math.ceil(len(some) / _SCANS_CHECKED) or 1]]
     if sensor is not None:
         tell_beyond(scans.root, sensor, ((frame.name, frame.points) for frame in frames))
     n, empty = 0, list[str]()

@@ -27,6 +27,7 @@ from edgeperc.datasets.layout import ScanLayout, class_number, known_layouts, re
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.judge import check_scans
 from edgeperc.evaluation.transfer import compare
 from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
 from edgeperc.inference.projection import make_projector
@@ -315,6 +316,11 @@ def test_folders_without_scans_labels_or_description(tmp_path: Path) -> None:
         ScanFolder(tmp_path, "vod")
     with pytest.raises(PointsError, match="no labels for its scans"):
         ScanFolder(folder_of(tmp_path))
+    for part in ("velodyne/000000.bin", "labels/0.label"):
+        (tmp_path / "set/sequences/00" / part).parent.mkdir(parents=True)
+        (tmp_path / "set/sequences/00" / part).write_bytes(b"0" * 16)
+    with pytest.raises(PointsError, match=r"no labels for its scans .* expected sequences/SEQ/labels/NAME\.label"):
+        ScanFolder(tmp_path / "set", "semantickitti")
     with pytest.raises(PointsError, match="no layout 'pandar'"):
         ScanFolder(tmp_path, "pandar")
     with pytest.raises(PointsError, match="no layout 'pandar'; expected av2"):
@@ -411,6 +417,16 @@ def test_an_evaluation_tells_of_another_unit_and_of_labels_of_another_scan(
         pytest.warns(UserWarning, match=r"nothing stands in 4 of 4 labeled boxes within 20 m, such as the car at x 5"),
     ):
         measure([str(root)])
+
+
+def test_of_a_single_drive_labels_of_other_scans_are_told_too(tmp_path: Path) -> None:
+    """Its first scan may hold few objects, or the right labels."""
+    root, _ = street(tmp_path, "hdl-64e", (3, 4), drives="one", splits={"test": ["*"]})
+    names = ScanFolder(root).names("test")
+    check_scans(ScanFolder(root), None, names)
+    (root / f"label/{names[-1]}.txt").write_text("".join(f"car {x} 0 0.4 4 2 1.6 0\n" for x in (5, 9, 13, 17)))
+    with pytest.warns(UserWarning, match=r"nothing stands in 4 of \d+ labeled boxes"):
+        check_scans(ScanFolder(root), None, names)
 
 
 def test_a_scan_is_of_one_drive(tmp_path: Path) -> None:
