@@ -248,7 +248,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
     if arguments.track and not (images or arguments.live or arguments.deskew):
-        warn_of_rate(scans, arguments.rate)
+        warn_of_rate(scans, arguments)
     names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     check_outputs(arguments, kinds, images, scans, targets)

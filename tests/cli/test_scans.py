@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cli_helpers import Shell, write_scan
@@ -19,7 +21,8 @@ START_US = 1532402927647951
 def told(names: list[str], rate_hz: float = 10.0) -> str:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        warn_of_rate([Path("drive") / name for name in names], rate_hz)
+        how = argparse.Namespace(rate=rate_hz, topic=None, remission_field=None, columns=None, origin=None)
+        warn_of_rate([Path("drive") / name for name in names], how)
     return " ".join(str(each.message) for each in said)
 
 
@@ -64,6 +67,21 @@ def test_a_drive_with_a_gap_is_told_where_it_is_tracked(tmp_path: Path, shell: S
         write_scan(tmp_path / f"{k}.bin")
     assert "2 scans are missing between 2.bin and 5.bin" in shell.err("run", tmp_path, "--anyway", "--track", code=0)
     assert "missing" not in shell.err("run", tmp_path, "--anyway", code=0)
+
+
+@pytest.mark.filterwarnings("default")
+def test_times_of_points_that_contradict_the_rate_are_told(tmp_path: Path, shell: Shell) -> None:
+    """A scan every 0.2 s, which takes 0.1 s; on a clock, or from the beginning of each scan."""
+    kinds = [*((name, "f4") for name in ("x", "y", "z", "intensity")), ("timestamp", "f8")]
+    for begin_s in (1.7e9, 0.0):
+        for k in range(4):
+            points = np.zeros(40, kinds)
+            points["x"] = points["y"] = np.arange(40.0)
+            points["timestamp"] = begin_s + (0.2 * k if begin_s else 0.0) + np.linspace(0.0, 0.1, 40)
+            np.save(tmp_path / f"{k}.npy", points)
+        said = shell.err("run", tmp_path, "--anyway", "--track", code=0)
+        assert ("by the times of their points, scans are 0.2 s apart" in said) == (begin_s > 0.0)
+        assert "--rate" not in shell.err("run", tmp_path, "--anyway", "--track", "--rate", "5", code=0)
 
 
 @pytest.mark.parametrize(
