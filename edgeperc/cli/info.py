@@ -24,6 +24,7 @@ from .scans import (
     check_scans,
     check_sensor,
     is_folder,
+    nothing_below,
     reading_options,
     scan_folders,
 )
@@ -363,6 +364,8 @@ def _scan_rows(
     from ..types.frame import ModelFrame
     from ..types.sensor import get_sensor
 
+    if is_folder(path) and not scan_folders(path):
+        raise PointsError(nothing_below(path))
     named, because = sensors.of(path)
     sensor = get_sensor(named)
     scans, damage = _first_scans(path, reading_options(path, arguments))

@@ -62,12 +62,20 @@ def scan_folders(root: Path) -> list[Path]:
     return [folder for folder in folders if folder.is_dir() and scan_files(folder)]
 
 
+# Where PandaSet and Argoverse 2 have scans, which are not read here.
+_UNREAD = ("lidar", "*/lidar", "sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar")
+
+
 def nothing_below(folder: Path | Remote) -> str:
-    """What to say of a folder without scans."""
+    """What to say of a folder without scans, by what lies where a data set would have them."""
     from ..readers.captures import nothing_in
 
     if isinstance(folder, Remote):
         return f"{folder}: no scan in this folder; expected scans or captures"
+    places = (place for layout in (*_LAYOUTS, *_UNREAD) for place in sorted(folder.glob(layout)) if place.is_dir())
+    place = next(places, None)
+    if place is not None:
+        return nothing_in(place)
     return f"{nothing_in(folder)}. Nor is it the root of a data set that 'edgeperc run --help' lists"
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 _ARCHIVE = "an archive; unpack it first"
 _FILM = "a film; edgeperc reads images (.jpg, .png), for a camera model"
 _TABLE = "read it with pandas, and pass a data frame of its columns x, y, z and intensity"
+_OF_SET = "docs/howto/train.md has lines that make .bin files of its scans"
 
 # First bytes, and what to say of them.
 _KNOWN: dict[bytes | tuple[bytes, ...], str] = {
     b"version https://git-lfs": "a pointer of Git LFS; the file itself is not there yet. Run: git lfs pull",
     b"LASF": "a LAS or LAZ file; convert it, e.g.: pdal translate FILE scan.pcd, or read it with laspy",
-    b"ARROW1": f"a Feather (Arrow) table, as of Argoverse 2; {_TABLE}",
+    b"ARROW1": f"a Feather (Arrow) table; of Argoverse 2, {_OF_SET}; of others, {_TABLE}",
     b"PAR1": f"a Parquet table; {_TABLE}",
     b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
     b"\x89HDF": "an HDF5 file; read it with h5py, and pass x, y, z and intensity as an array of shape (n, 4)",
@@ -34,8 +35,8 @@ def advice_for(head: bytes, name: str = "") -> str | None:
     """What a file of another format is, and what to do; None if its first bytes are not known."""
     if head.startswith(b"\x1f\x8b") and name.lower().endswith(".pkl.gz"):
         return (
-            "a pickle in gzip; of PandaSet, edgeperc eval ROOT:pandaset reads it, and docs/howto/train.md has lines "
-            "that make .bin files of its scans; others are never unpickled: save the points as .npy"
+            f"a pickle in gzip; of PandaSet, edgeperc eval ROOT:pandaset reads it, and {_OF_SET}; others are never "
+            "unpickled: save the points as .npy"
         )
     if head[4:8] == b"ftyp":
         return _FILM

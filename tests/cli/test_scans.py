@@ -121,12 +121,16 @@ def test_the_root_of_a_data_set_is_read(below: str, tmp_path: Path, shell: Shell
 def test_a_folder_without_scans_says_what_is_in_it(
     name: str, content: bytes, said: str, tmp_path: Path, shell: Shell
 ) -> None:
+    """And the root of a data set whose scans are such files."""
+    tmp_path = tmp_path / "001/lidar"
+    tmp_path.mkdir(parents=True)
     (tmp_path / ".hidden.pkl").write_bytes(b"\x80\x04")
     (tmp_path / name).write_bytes(content)
     with pytest.raises(PointsError, match=r"no scan in this folder.*" + re.escape(said)):
         next(read_scans(tmp_path))
     for command in ("run", "info"):
         assert said in shell.err(command, tmp_path, code=1)
+        assert said in shell.err(command, tmp_path.parents[1], code=1)
     assert said in shell.err("fit-sensor", tmp_path, "--sensor", "hdl-64e", "--out", tmp_path / "a.json", code=2)
 
 
