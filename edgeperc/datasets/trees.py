@@ -305,12 +305,12 @@ class PandaSet(Tree):
                 boxes = _cuboids(read_pickled(boxes_of), into)
             if classes_of.is_file():
                 numbers = read_pickled(classes_of)["class"]
-                if len(numbers) != len(of_lidar):
-                    raise ValueError(f"{len(numbers)} classes for {len(of_lidar)} points")
+                if len(numbers) != len(of_lidar) or numbers.dtype.kind not in "iu":
+                    raise ValueError(f"{len(numbers)} classes, of the type {numbers.dtype}, for {len(of_lidar)} points")
                 numbers = numbers[of_lidar].astype(np.uint64)
         except PointsError:
             raise
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
             raise PointsError(f"{path}, its labels or its poses.json are not as PandaSet's ({exc!r:.100})") from exc
         return Labeled(points, boxes, numbers, None)
 

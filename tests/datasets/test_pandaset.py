@@ -198,6 +198,7 @@ def without(path: str) -> Callable[[Path], Any]:
         (lambda root: (root / "001/lidar/poses.json").write_text("[]"), r"not as PandaSet's \(IndexError"),
         (lambda root: (root / "001/lidar/poses.json").write_text('[{"position": 1}]'), r"not as PandaSet's"),
         (lambda root: as_published(root / "001/annotations/semseg/00.pkl.gz", {"class": np.zeros(3)}), "3 classes"),
+        (lambda root: as_published(root / "001/annotations/semseg/00.pkl.gz", {"class": np.zeros(4)}), "type float64"),
         (lambda root: as_published(root / "001/lidar/00.pkl.gz", {"x": np.zeros(4)}), r"KeyError\('d'\)"),
         (lambda root: (root / "001/lidar/00.pkl.gz").write_bytes(b""), r"00\.pkl\.gz is damaged"),
         (lambda root: (root / "001/lidar/00.pkl.gz").write_bytes(b"version https://git-lfs"), "gzip data is damaged"),
