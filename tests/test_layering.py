@@ -122,6 +122,7 @@ FLOORS = {
         cli.completion cli.doctor cli.evaluation.box_tables cli.evaluation.painting cli.evaluation.unlabeled
         cli.lists cli.program
         cli.report cli.scans cli.sinks
+        cli.scan_times
         cli.cvat cli.evaluation.sensors cli.fit_sensor cli.info cli.outputs cli.side_by_side
         cli.evaluation.scans cli.run
         cli.demo cli.evaluation.tracking cli.ros2

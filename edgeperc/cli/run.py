@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
@@ -35,6 +36,7 @@ from .arguments import (
 from .output import make_folder, make_places, print_error, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Report
+from .scan_times import times_of, warn_of_rate
 from .scans import (
     Scans,
     Sensors,
@@ -50,7 +52,6 @@ from .scans import (
     scan_folders,
     scan_namer,
     stated_sensor,
-    warn_of_rate,
     with_mounting,
 )
 from .side_by_side import (
@@ -138,7 +139,7 @@ def add_parser(commands: Commands) -> None:
     )
     reading(
         "--poses FILE",
-        "poses of the sensor on the clock of the scans, for --deskew and, with it, --track: lines of time [s], x, y, z "
+        "poses of the sensor on the clock of the scans, for --deskew, --track and --sweeps: lines of time [s], x, y, z "
         "[m] and the quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
     )
     reading(
@@ -198,6 +199,12 @@ def add_parser(commands: Commands) -> None:
         "ports, without files of each scan, --gif, --deskew and --consistency)",
     )
     live("--rate HZ", "scans per second of files without time stamps (default: 10)", type=positive_number, default=10.0)
+    live(
+        "--times FILE",
+        "times of the scan files of one drive: a line of seconds, or of a date with a time, for each scan, or for each "
+        "number in their names from 0 on, as KITTI's timestamps.txt and times.txt (default: as --rate says)",
+        type=Path,
+    )
 
 
 def make_perceiver(
@@ -247,7 +254,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     elif scans:
         check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
-    if arguments.track and not (images or arguments.live or arguments.deskew):
+    times = {} if arguments.times is None else times_of(arguments.times, scans)
+    if arguments.track and not (images or arguments.live or arguments.deskew or times):
         warn_of_rate(scans, arguments)
     names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
@@ -269,7 +277,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     sinks = Sinks(arguments, of_ports=of_ports)
     try:
         with progress("file") as show, sinks:
-            run = _Run(arguments, perceivers, kinds, sinks)
+            run = _Run(arguments, perceivers, kinds, sinks, times)
             if has_workers(arguments):
                 perceive_side_by_side(arguments, _alone, perceivers, scans, targets, report, show)
             for done, (scan, target) in enumerate(() if has_workers(arguments) else zip(scans, targets, strict=True)):
@@ -338,8 +346,10 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
             require("kiss_icp", "slam", "--sweeps without --poses", package="kiss-icp")
     if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
         arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
-    if arguments.poses is not None and not arguments.deskew:
-        arguments.usage_error("--poses needs --deskew")
+    if arguments.poses is not None and not (arguments.deskew or (arguments.track and not arguments.live)):
+        arguments.usage_error("--poses needs --deskew or --track, and no --live")
+    if arguments.times is not None and (arguments.live or has_workers(arguments)):
+        arguments.usage_error("--times needs no --live and no worker processes")
     if arguments.accumulate is not None and arguments.sensor in (None, AUTO_SENSOR):
         arguments.usage_error("--accumulate needs --sensor with the name of one that does not spin, such as mid-360")
     if arguments.live and any(value is not None for value in file_options(arguments).values()):
@@ -372,8 +382,8 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
             arguments.usage_error(f"--calib is for KITTI's {what}, or paint those of others in Python")
     if not images:
         return {}
-    if arguments.live or arguments.deskew:
-        option = "--live" if arguments.live else "--deskew"
+    of_scans_alone = ("live", "deskew", "poses", "times")
+    if option := next((f"--{name}" for name in of_scans_alone if getattr(arguments, name)), None):
         arguments.usage_error(f"{option} needs scans, and {next(iter(images))} is an image; leave it out")
     of_scans = [kind for kind in (*kinds, *(["track"] if arguments.track else [])) if kind != "png"]
     of_scans += [name.replace("_", "-") for name in wanted_sinks(arguments)]
@@ -465,15 +475,21 @@ class _Run:
     """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
     def __init__(
-        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sinks
+        self,
+        arguments: argparse.Namespace,
+        perceivers: _Perceivers,
+        kinds: Sequence[str],
+        sinks: Sinks,
+        times: Mapping[Path | Remote, float] = MappingProxyType({}),
     ) -> None:
         from ..tracking.tracker import Tracker
 
         self._arguments, self._perceivers, self._kinds, self._sinks = arguments, perceivers, kinds, sinks
+        self._times = times
         self._tracker = Tracker() if arguments.track else None
         self._straightener = None
         self._sweeps = self._odometry = None
-        if arguments.deskew:
+        if arguments.deskew or arguments.poses is not None:
             from .straighten import Straightener
 
             self._straightener = Straightener(_trajectory(arguments))
@@ -497,13 +513,13 @@ class _Run:
             yield from through_temporary(self.scans, path, target)
             self._n = max(self._n, n_after)
             return
-        shown, numbered = shown or path, is_capture(path)
+        arguments, shown, numbered = self._arguments, shown or path, is_capture(path)
         try:
             sensor = self._perceivers.sensor_of(path, shown if isinstance(shown, Remote) else None)
             perceive = self._perceivers.of(sensor)
-            read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
+            read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if arguments.deskew else read_scans
             how = reading_options(path, self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
-            if how["accumulate_s"] is not None and self._straightener is None:
+            if how["accumulate_s"] is not None and not arguments.deskew:
                 warnings.warn(
                     f"{shown}: the points of the last {how['accumulate_s']:g} s are taken as seen from one place; "
                     "if the sensor moves, pass --deskew with --poses FILE or --track",
@@ -514,10 +530,13 @@ class _Run:
                 how["origin_m"] = self._origin(path)
             for k, (stamp_s, points, *times_s) in enumerate(read(path, **how)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
+                stamp_s = self._times.get(shown, stamp_s)
                 at_s = self._at_s(stamp_s)
                 try:
-                    if self._straightener is not None:
+                    if arguments.deskew and self._straightener is not None:
                         points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
+                    elif self._straightener is not None:
+                        self._straightener.place(stamp_s)
                     pose, earlier = self._pose(points, at_s, how["origin_m"]), None
                     if self._sweeps is not None:
                         earlier = self._sweeps.earlier(points, at_s, pose)

@@ -24,7 +24,7 @@ from .arguments import check_inputs, file_options
 if TYPE_CHECKING:
     from ..preprocess.sensor_estimate import SensorEstimate
     from ..readers.identify import KnownSensor
-    from ..types.points import Floats, Floats32
+    from ..types.points import Floats32
     from ..types.sensor import SensorProfile
 
 
@@ -41,7 +41,7 @@ _LAYOUTS = (
 )
 # Folder names of these layouts that do not identify a scan.
 _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
-_TIME = re.compile(r"[1-9]\d{9,}(\.\d+)?")  # a name that is a time since 1970, in s to ns
+TIME_IN_NAME = re.compile(r"[1-9]\d{9,}(\.\d+)?")  # a name that is a time since 1970, in s to ns
 
 
 class Scans(NamedTuple):
@@ -189,7 +189,7 @@ def _warn_of_times(pairs: Sequence[tuple[Path, Path | Remote]]) -> None:
     from ..sinks.run_file import stem_of
 
     stems = [[stem_of(file.name)[0] for file in pair] for pair in pairs]
-    if not all(_TIME.fullmatch(stem) for pair in stems for stem in pair):
+    if not all(TIME_IN_NAME.fullmatch(stem) for pair in stems for stem in pair):
         return
     times = np.array(stems, np.float64)
     for (image, scan), (at, taken) in zip(pairs, times, strict=True):
@@ -202,89 +202,6 @@ def _warn_of_times(pairs: Sequence[tuple[Path, Path | Remote]]) -> None:
                 stacklevel=3,
             )
             return
-
-
-_SPUN_S = (0.01, 30.0)  # between two scans; what is outside is no time, as a date written in digits
-_GAP = 1.5  # times the usual step between two scans, from which on some are missing
-
-
-def warn_of_rate(scans: Iterable[Path | Remote], arguments: argparse.Namespace) -> None:
-    """Warn of scan files that are not ``1 / --rate`` apart by their names or their points: speeds of tracks
-    would be wrong, and tracks would go on from one scene to the next. Names may count anything, so nothing is taken
-    from them.
-    """
-    folders: dict[Path | Remote, list[Path | Remote]] = {}
-    for scan in scans:
-        if not is_recording(scan):
-            folders.setdefault(scan.parent, []).append(scan)
-    for folder, files in folders.items():
-        told = _contradiction([file.name for file in files], arguments.rate)
-        first = [file for file in files[:_TIMED] if isinstance(file, Path)]
-        if told := told or _other_rate(_stamps(first, arguments), arguments.rate, "the times of their points"):
-            warnings.warn(f"--track: {folder}: {told}", stacklevel=2)
-
-
-_TIMED = 4  # files that are read for their times
-
-
-def _stamps(files: Iterable[Path], arguments: argparse.Namespace) -> list[float]:
-    """The times of scan files by those of their points, where these are on a clock."""
-    from ..readers.captures import read_timed_scans
-
-    stamps_s = []
-    for file in files:
-        # What is wrong with one is told when its turn comes.
-        with warnings.catch_warnings(), suppress(EdgepercError, OSError):
-            warnings.simplefilter("ignore")
-            scans = read_timed_scans(file, **reading_options(file, arguments) | {"origin_m": None})
-            stamps_s += [scan.stamp_s for scan in scans if scan.stamp_s is not None]
-    return stamps_s
-
-
-def _other_rate(times_s: Sequence[float] | Floats, rate_hz: float, by: str) -> str:
-    """At which rate scans with these times came, if it is another one; empty if not."""
-    import numpy as np
-
-    usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
-    if not _SPUN_S[0] < usual_s < _SPUN_S[1] or 0.8 < usual_s * rate_hz < 1.25:
-        return ""
-    return (
-        f"by {by}, scans are {usual_s:.3g} s apart, and taken as {1.0 / rate_hz:g} s apart, so that speeds would be "
-        f"wrong; pass --rate {1.0 / usual_s:.3g}"
-    )
-
-
-def _contradiction(names: Sequence[str], rate_hz: float) -> str:
-    """How names contradict that scans follow one another at a rate, and what to do; empty if they do not."""
-    import numpy as np
-
-    from ..sinks.run_file import stem_of
-
-    ends = [re.search(r"\d+(\.\d+)?$", stem_of(name)[0]) for name in names]
-    words = [end[0] for end in ends if end is not None]
-    if len(words) < max(3, len(names)):
-        return ""
-    values, are_times = np.array(words, np.float64), all(map(_TIME.fullmatch, words))
-    if are_times:  # ms, us and ns have three digits more each
-        values *= [10.0 ** (-3 * (max(len(word.partition(".")[0]) - 8, 0) // 3)) for word in words]
-    elif any("." in word for word in words):
-        return ""
-    steps = np.diff(values)
-    usual = float(np.median(steps))
-    if are_times and (told := _other_rate(values, rate_hz, "the times in their names")):
-        return told
-    is_gap = (steps > _GAP * usual) | (steps < 0.0)
-    if usual <= 0.0 or (are_times and usual < _SPUN_S[0]) or not is_gap.any():
-        return ""
-    k, n_more = int(is_gap.argmax()), int(is_gap.sum()) - 1
-    gap = f"{steps[k]:.3g} s pass" if are_times else f"{steps[k] / usual - 1.0:,.0f} scans are missing"
-    gap = f"{'times' if are_times else 'numbers'} go back" if steps[k] < 0.0 else gap
-    more = f" (and {n_more:,} more such gaps)" if n_more else ""
-    return (
-        f"by their names, {gap} between {names[k]} and {names[k + 1]}{more}. The two are taken as "
-        f"{1.0 / rate_hz:g} s apart, so that speeds would be wrong, "
-        "and tracks go on; put the scans before and behind the gap into folders of their own"
-    )
 
 
 def scan_namer(path: Path) -> Callable[[int], Path]:

@@ -38,7 +38,8 @@ class Straightener:
             )
         known = times_s[np.isfinite(times_s)]
         if not len(known):
-            self._place(stamp_s)
+            if stamp_s is not None:
+                self.place(stamp_s)
             return points
         first_s, last_s = float(known.min()), float(known.max())
         if self._trajectory is not None:
@@ -59,15 +60,18 @@ class Straightener:
         beside_s = last_s - first_s
         is_near = stamp_s is not None and first_s - beside_s <= stamp_s <= last_s + beside_s
         at_s = stamp_s if is_near else last_s
-        self._place(at_s)
+        self.place(at_s)
         scan = points if sensor is None else returns(points, sensor)[0]
         straight = deskew(scan, times_s, motion, at_s=at_s)
         dropped = np.isnan(scan[:, 0])
         straight[dropped] = points[dropped]
         return straight
 
-    def _place(self, at_s: float | None) -> None:
-        if self._trajectory is not None and at_s is not None:
+    def place(self, at_s: float | None) -> None:
+        """Find the pose of a scan that stays as it is. PointsError without a time and with poses."""
+        if self._trajectory is not None:
+            if at_s is None:
+                raise PointsError("the scan has no time, by which its pose is found; pass --times FILE")
             pose = self._trajectory.pose(at_s)
             self._begin = pose if self._begin is None else self._begin
             self.pose = np.linalg.inv(self._begin) @ pose

@@ -277,7 +277,7 @@ def test_completion_knows_commands_options_and_names(name: str, shell: Shell) ->
     [
         ("edgeperc mod", {"models"}),
         ("edgeperc run --full", {"--full-turn"}),
-        ("edgeperc run --sensor pandarx", {"pandarxt-32"}),
+        ("edgeperc run --sensor pandarx", {"pandarxt-32", "pandarxt-32m"}),
         ("edgeperc run --model ssad", {"ssadnet", "ssadnet-open"}),
         ("edgeperc info sca", {"scan.bin"}),
     ],
@@ -300,7 +300,7 @@ def test_fish_completes(typed: str, found: set[str], tmp_path: Path, shell: Shel
         (["run", "--full"], {"--full-turn"}),
         (["run", "--precision", "b"], {"bf16"}),
         (["run", "--model", "ssad"], {"ssadnet", "ssadnet-open"}),
-        (["run", "--sensor", "pandarx"], {"pandarxt-32"}),
+        (["run", "--sensor", "pandarx"], {"pandarxt-32", "pandarxt-32m"}),
         (["run", "--model", "ssadnet", "sca"], {"scan.bin"}),
         (["info", "sca"], {"scan.bin"}),
         (["eval-tracking", "--gif", "sca"], {"scan.bin"}),

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import argparse
 import re
+import tempfile
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cli_helpers import Shell, write_scan
-from edgeperc import PointsError, read_scans
-from edgeperc.cli.scans import find_scans, warn_of_rate
+from edgeperc import PointsError, StampError, Tracker, read_scans
+from edgeperc.cli.scan_times import times_of, warn_of_rate
+from edgeperc.cli.scans import find_scans
 
 TOP = "n015-2018-07-24__LIDAR_TOP__{}.pcd.bin"  # as nuScenes calls them
 START_US = 1532402927647951
@@ -140,3 +145,85 @@ def test_the_direction_of_nuscenes_is_asked_for(tmp_path: Path, shell: Shell) ->
     assert "pass --turn -90" in shell.err("run", scan, "--sensor", "nuscenes", "--anyway", code=0)
     for turn in ("-90", "0", "street"):
         assert "--turn -90" not in shell.err("run", scan, "--sensor", "nuscenes", f"--turn={turn}", "--anyway", code=0)
+
+
+SCANS = [Path(f"drive/{number:010d}.bin") for number in (0, 1, 2, 4)]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.0\n0.1\n\n0.2\n0.4\n", [0.0, 0.1, 0.2, 0.4]),  # one for each
+        ("# s\r\n-1.5\r\n-5e-1\r\n0\r\n1e1", [-1.5, -0.5, 0.0, 10.0]),
+        ("0\n.1\n.2\n.3\n.4\n.5\n", [0.0, 0.1, 0.2, 0.4]),  # of each number
+        (
+            "".join(f"2011-09-26 13:02:{25 + k}.594360375\n" for k in range(5)),
+            [1317042145.594360375 + k for k in (0, 1, 2, 4)],
+        ),
+    ],
+    ids=["one for each", "signs", "of each number", "dates"],
+)
+def test_times_of_scan_files(tmp_path: Path, text: str, expected: list[float]) -> None:
+    file = tmp_path / "times.txt"
+    file.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    times = times_of(file, SCANS)
+    assert [*times] == SCANS
+    np.testing.assert_allclose([*times.values()], expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "scans", "said"),
+    [
+        ("0\n1\n2", SCANS, "3 times for 4 scans"),
+        ("0\n1\n2\n3\n4\n5", [*SCANS[:3], Path("drive/last.bin")], "6 times for 4 scans"),
+        ("0\n1\n1\n2", SCANS, "time 3 is 1"),
+        ("0\nnan\n1\n2", SCANS, "time 2 is nan"),
+        ("0 1 2 3", SCANS, "time 1 is 0 1 2 3"),
+        ("2011-09-26\n13:02", SCANS, "time 2 is 13:02"),
+        ("", SCANS, "0 times for 4 scans"),
+        ("0\n1\n2\n3", [*SCANS[:3], Path("other/0.bin")], "of one folder"),
+    ],
+)
+def test_times_that_are_of_no_use(tmp_path: Path, text: str, scans: list[Path], said: str) -> None:
+    file = tmp_path / "times.txt"
+    file.write_text(text)
+    with pytest.raises(StampError, match=said):
+        times_of(file, scans)
+
+
+@given(st.text(alphabet="0123456789-:. eE\n\t#naif", max_size=60))
+def test_any_times_are_read_or_a_typed_error(text: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "times.txt"
+        file.write_text(text)
+        try:
+            times = [*times_of(file, SCANS[:2]).values()]
+        except StampError:
+            return
+        assert times == sorted(times)
+        assert np.isfinite(times).all()
+
+
+@pytest.mark.filterwarnings("default")
+def test_scan_files_with_times_have_poses(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without times of their points, they are tracked, and several are looked at, at the poses of a file."""
+    for number in (3, 4, 6):
+        write_scan(tmp_path / "drive" / f"{number}.bin")
+    (tmp_path / "times.txt").write_text("".join(f"{10.0 + 0.2 * k}\n" for k in range(8)))
+    poses = "".join(f"{10.0 + 0.2 * k} {2.0 * k} 0 0 0 0 0 1\n" for k in range(8))
+    (tmp_path / "poses.txt").write_text(poses)
+    tracked = [tmp_path / "drive", "--anyway", "--track", "--poses", tmp_path / "poses.txt"]
+    update, seen = Tracker.update, list[tuple[float, float]]()
+
+    def note(self: Tracker, boxes: Any, stamp_s: float, pose: Any = None, **how: Any) -> Any:
+        if pose is not None:  # of the first one, which compiles
+            seen.append((stamp_s, float(pose[0][3])))
+        return update(self, boxes, stamp_s, pose, **how)
+
+    monkeypatch.setattr(Tracker, "update", note)
+    answers = shell.records("run", *tracked, "--times", tmp_path / "times.txt", "--sweeps", "3")
+    assert [answer["stamp_s"] for answer in answers] == pytest.approx([10.6, 10.8, 11.2])
+    np.testing.assert_allclose(seen, [(10.6, 0.0), (10.8, 2.0), (11.2, 6.0)], atol=1e-6)
+    assert "the scan has no time, by which its pose is found; pass --times FILE" in shell.err("run", *tracked, code=1)
+    (tmp_path / "drive.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
+    assert "is of the scan files" in shell.err("run", tmp_path / "drive.pcap", "--times", tmp_path / "times.txt")
