@@ -75,6 +75,7 @@ def predict(engine: str, precision: str, scan: np.ndarray) -> Prediction:
 @pytest.mark.parametrize("error", [BrokenPipeError, ConnectionResetError, EOFError])
 def test_a_contender_ends_in_silence_after_its_parent(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
     """Each interrupted comparison left a traceback."""
+    pytest.importorskip("psutil")
     monkeypatch.setattr(turns.signal, "signal", Mock())
     gone = Mock(send=Mock(side_effect=error), recv=Mock(side_effect=EOFError))
     turns.serve(gone, peers.Contender("", "peak", "copy"), (), "hdl-64e", 1)
