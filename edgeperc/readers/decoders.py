@@ -46,7 +46,7 @@ from .packets import (
     velodyne_packets,
 )
 from .ports import is_port, listen
-from .senders import Senders, layouts_beside
+from .senders import ALONE, Senders, Whose, layouts_beside
 from .tables import MAX_BYTES
 from .times import TimedScan, of_plausible_duration, point_times
 
@@ -104,13 +104,14 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             frames, chosen = _open_osf(path, topic)
             yield {"metadata": frames.sensor_info[chosen].to_json_string()}
         else:
-            payloads, unit = list[memoryview](), None
+            payloads, unit, whose = list[memoryview](), None, ALONE
             for name, message, _ in _clouds(path, topic, alive):
                 if isinstance(message, VelodyneScan):
                     names = {velodyne_name(packet) for _, packet in message.packets}
                     yield {"velodyne": sorted(names, key=str)}
                 elif isinstance(message, LidarPackets):
-                    payloads, unit = [*payloads, *(packet for _, packet in message.packets)], message.unit
+                    payloads += [packet for _, packet in message.packets]
+                    unit, whose = message.unit, message.whose
                     if len(payloads) >= _DESCRIBED:
                         break
                 elif isinstance(message, OusterPacket):
@@ -120,7 +121,7 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             if payloads:
                 from .lidars import describe_packets  # numba
 
-                yield describe_packets(path, payloads, unit)
+                yield describe_packets(path, payloads, unit, whose)
 
     return next(_with_typed_errors(path, found()))
 
@@ -417,7 +418,9 @@ def _clouds(path: Path, topic: str | None, alive: Callable[[], None]) -> Iterato
             elif isinstance(message, LidarPackets):
                 if unit is None and any(bytes(packet[:4]) in ROBOSENSE for _, packet in message.packets):
                     unit = (_unit(files, topics, chosen),)
-                message = message._replace(unit=unit and unit[0])
+                kinds = {channel.msgtype for channel in clouds if channel.topic == chosen}
+                alike = sorted({channel.topic for channel in clouds if channel.msgtype in kinds})
+                message = message._replace(unit=unit and unit[0], whose=Whose(chosen, names, alike))
             stamp = message.header.stamp
             stamp_s, stamp_ns = stamp.sec + 1e-9 * stamp.nanosec, 10**9 * stamp.sec + stamp.nanosec
             yield chosen, message, Stamp(stamp_s, stamp_ns) if stamp_ns else Stamp(1e-9 * recorded_ns, recorded_ns)

@@ -112,7 +112,8 @@ def _of_lidar(path: Path, senders: Senders, topic: str | None, *, beside: bool) 
 
     sender = topic if topic in lidar.senders and len(lidar.senders) > 1 else None
     unit = unit_at(path, sender or lidar.first)
-    row, angles = open_spinning(path, lidar.row, payloads_of(path, sender, lambda: None), unit)
+    payloads = payloads_of(path, sender, lambda: None)
+    row, angles = open_spinning(path, lidar.row, payloads, lidar.whose(sender), unit)
     return of_spinning(row.name, angles.lasers_deg.tolist(), columns_of(row, payloads_of(path, sender, lambda: None)))
 
 

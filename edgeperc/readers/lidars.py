@@ -18,7 +18,7 @@ from .mems_packets import MemsFormat, MemsStream, mems_format_of
 from .mirror_packets import MirrorStream, read_mirrors
 from .packets import Datagrams
 from .ports import is_port, named
-from .senders import Lidar, not_decoded
+from .senders import ALONE, Lidar, Whose, in_files, not_decoded
 from .spinning_packets import (
     ALIKE,
     FORMATS,
@@ -40,12 +40,11 @@ Opened = tuple[SpinningStream | MemsStream | MirrorStream, Callable[[memoryview]
 
 
 def open_spinning(
-    path: Path, row: Format, payloads: Iterable[memoryview], unit: str | None = None
+    path: Path, row: Format, payloads: Iterable[memoryview], whose: Whose = ALONE, unit: str | None = None
 ) -> tuple[Format, Angles]:
     """The format and angles of a spinning sensor; PointsError if neither its packets nor a file beside the capture has
     them, nor the sensor itself tells them, where it is at an address now.
     """
-    file = _file_of(path, ".csv")
     said = Angles(np.array([[each, 0.0] for each in row.elevations_deg])) if row.elevations_deg else None
     for payload in () if row.is_hesai else payloads:
         if row.name == "helios-32" and angles_of_difop(FORMATS["helios-16"], payload) is not None:
@@ -53,11 +52,12 @@ def open_spinning(
         said = angles_of_difop(row, payload)
         if said is not None:
             break
-    if file is not None and (said is None or row.elevations_deg):
+    file = _file_of(path, ".csv", whose) if said is None or row.elevations_deg else None
+    if file is not None:
         angles = read_angles(file, row)
         return told_apart(row, angles), angles
     if said is None and row.is_hesai and unit is not None:
-        with _asked(f"the angles of the lasers of this {row.title} are not known", path, ".csv"):
+        with _asked(f"the angles of the lasers of this {row.title} are not known", f"{_stem(path, whose)}.csv"):
             angles = read_angles(hesai_calibration(unit), row)
             return told_apart(row, angles), angles
     if said is None:
@@ -65,23 +65,22 @@ def open_spinning(
         if there and is_port(path):
             there += f"Listen to its port, too: {path},7788. Or: "
         titles = " or ".join(FORMATS[name].title for name in (row.name, ALIKE.get(row.name)) if name)
-        whose = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"
+        what = "Hesai's calibration of the unit" if row.is_hesai else "a row 'elevation,azimuth' for each laser [deg]"
         raise PointsError(
-            f"the angles of the lasers of this {titles} are not known. {there}Put {whose} beside it, as "
-            f"{named(path).stem}.csv"
+            f"the angles of the lasers of this {titles} are not known. {there}Put {what} beside it, as "
+            f"{_stem(path, whose)}.csv"
         )
     return row, said
 
 
 @contextmanager
-def _asked(unknown: str, path: Path, suffix: str) -> Iterator[None]:
+def _asked(unknown: str, name: str) -> Iterator[None]:
     """Say what to do where a live sensor does not answer, or what is of no use."""
     try:
         yield
     except PointsError as exc:
         raise PointsError(
-            f"{unknown}. {exc}. Save the calibration of the unit from its web page into the current folder, as "
-            f"{named(path).stem}{suffix}"
+            f"{unknown}. {exc}. Save the calibration of the unit from its web page into the current folder, as {name}"
         ) from exc
 
 
@@ -90,12 +89,30 @@ def unit_at(path: Path, sender: str) -> str | None:
     return sender.partition(":")[0] if is_port(path) else None
 
 
-def _file_of(path: Path, suffix: str) -> Path | None:
-    """Of drive.pcap drive.csv, else drive_angles.csv; drive2.csv is of another capture."""
+def _stem(path: Path, whose: Whose) -> str:
+    """What the file of a sensor's calibration is to be called, without its suffix."""
+    return named(path).stem + (f"_{in_files(whose.name)}" if len(whose.all) > 1 else "")
+
+
+def _file_of(path: Path, suffix: str, whose: Whose) -> Path | None:
+    """Of drive.pcap drive.csv, else drive_angles.csv; of one of several sensors, drive_ADDRESS.csv or drive_TOPIC.csv;
+    drive2.csv is of another capture. PointsError if a file may be of several sensors.
+    """
     path = named(path)
     files = sorted(path.absolute().parent.glob(f"*{suffix}"))
     own = [file for file in files if re.fullmatch(re.escape(path.stem) + r"([\W_].*)?", file.stem)]
-    return min(own, key=lambda each: len(each.stem), default=None)
+    names = [file.stem[len(path.stem) + 1 :] for file in own]
+    if in_files(whose.name) in names:
+        return own[names.index(in_files(whose.name))]
+    of_others = {in_files(other) for other in whose.all}
+    shared = [file for file, name in zip(own, names, strict=True) if name not in of_others]
+    file = min(shared, key=lambda each: len(each.stem), default=None)
+    if file is not None and len(whose.alike) > 1:
+        raise PointsError(
+            f"{file.name} does not say of which sensor it is, {' or '.join(whose.alike)}. Put the calibration of each "
+            f"beside the recording; of this one, as {_stem(path, whose)}{suffix}"
+        )
+    return file
 
 
 def columns_of(row: Format, payloads: Iterable[memoryview]) -> int:
@@ -117,13 +134,13 @@ def payloads_of(
     return (datagram.payload for datagram in datagrams if datagram.is_from(sender))
 
 
-def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview]) -> Opened | None:
+def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview], whose: Whose = ALONE) -> Opened | None:
     """`open_stream` of a sensor that sends such packets; None if it has no points.
 
     Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
     """
     row = _known_format(payload)
-    return None if row is None else open_stream(path, row, units)
+    return None if row is None else open_stream(path, row, units, whose)
 
 
 def _known_format(payload: memoryview) -> Format | MemsFormat | None:
@@ -134,22 +151,24 @@ def _known_format(payload: memoryview) -> Format | MemsFormat | None:
     return row
 
 
-def open_stream(path: Path, row: Format | MemsFormat, units: Iterable[memoryview], unit: str | None = None) -> Opened:
+def open_stream(
+    path: Path, row: Format | MemsFormat, units: Iterable[memoryview], whose: Whose = ALONE, unit: str | None = None
+) -> Opened:
     """What makes scans of the packets of a format, and tells them from others; PointsError as of `open_spinning`."""
     if isinstance(row, MemsFormat):
         return MemsStream(row), lambda payload: mems_format_of(payload) is row
     if not row.spins:
-        file = _file_of(path, ".dat")
+        file = _file_of(path, ".dat", whose)
         if file is None and unit is not None:
-            with _asked(f"where the lasers of this {row.title} look is not known", path, ".dat"):
+            with _asked(f"where the lasers of this {row.title} look is not known", f"{_stem(path, whose)}.dat"):
                 return MirrorStream(row, read_mirrors(hesai_calibration(unit))), partial(is_of, row)
         if file is None:
             raise PointsError(
                 f"where the lasers of this {row.title} look is not known. Put the correction file of the unit beside "
-                f"it, as {named(path).stem}.dat"
+                f"it, as {_stem(path, whose)}.dat"
             )
         return MirrorStream(row, read_mirrors(file)), partial(is_of, row)
-    found, angles = open_spinning(path, row, units, unit)
+    found, angles = open_spinning(path, row, units, whose, unit)
     return SpinningStream(found, angles), partial(is_of, found)
 
 
@@ -159,14 +178,16 @@ def is_of(row: Format, payload: memoryview) -> bool:
     return found is not None and (found == row or row.name == ALIKE.get(found.name))
 
 
-def describe_packets(path: Path, payloads: Sequence[memoryview], unit: memoryview | None) -> dict[str, Any]:
+def describe_packets(
+    path: Path, payloads: Sequence[memoryview], unit: memoryview | None, whose: Whose
+) -> dict[str, Any]:
     """What packets in messages say about their sensor; see `decoders.describe`."""
     found = next((row for row in map(_known_format, payloads) if row is not None), None)
     if found is None:
         raise PointsError("the packets hold no points of a sensor that is known")
     if isinstance(found, MemsFormat) or not found.spins:
         return {"model": found.name}
-    row, angles = open_spinning(path, found, [] if unit is None else [unit])
+    row, angles = open_spinning(path, found, [] if unit is None else [unit], whose)
     n = columns_of(row, payloads)
     return {"spinning": row.name, "lasers_deg": angles.lasers_deg.tolist(), "columns": n}
 
@@ -179,7 +200,8 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     """
     first = sender or lidar.first
     if lidar.row is not None:
-        stream, is_of_sensor = open_stream(path, lidar.row, payloads_of(path, sender, alive), unit_at(path, first))
+        payloads, unit = payloads_of(path, sender, alive), unit_at(path, first)
+        stream, is_of_sensor = open_stream(path, lidar.row, payloads, lidar.whose(sender), unit)
         for payload in payloads_of(path, first, alive, endless=True):
             if is_of_sensor(payload):
                 yield from stream.add(payload)

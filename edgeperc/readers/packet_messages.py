@@ -19,6 +19,7 @@ from ..types.points import as_points
 from .clouds import CLOUD_READERS, Header, MessageReader, Stamp, cdr_reader, ros1_reader
 from .mcap import Channel
 from .packets import DIFOP, VELODYNE_BYTES, velodyne_name
+from .senders import ALONE, Whose
 from .times import TimedScan
 
 
@@ -43,6 +44,7 @@ class LidarPackets(NamedTuple):
     header: Header
     packets: tuple[tuple[int, memoryview], ...]
     unit: memoryview | None = None  # what a RoboSense says of itself (DIFOP), of any message
+    whose: Whose = ALONE
 
 
 Packets = VelodyneScan | OusterPacket | LidarPackets
@@ -239,7 +241,7 @@ class LidarMessages(_Turns):
 
         units = [] if message.unit is None else [message.unit]
         for stamp_ns, packet in message.packets:
-            if self._stream is None and (found := stream_of(self._path, packet, units)) is not None:
+            if self._stream is None and (found := stream_of(self._path, packet, units, message.whose)) is not None:
                 self._stream, self._is_of = found
             if self._stream is not None and self._is_of(packet):
                 yield from map(self._of_computer, self._stream.add(packet))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -24,12 +25,34 @@ _LIVOX_SIZES = (1380, 804, 996)
 _BY_CHANCE = 20  # packets of other sensors that may begin like these
 
 
+class Whose(NamedTuple):
+    """One of the sensors of a recording: what the file of its calibration is called after."""
+
+    name: str = ""  # its address or topic
+    all: Sequence[str] = ()  # those of all
+    alike: Sequence[str] = ()  # of those of which a calibration may be, too, as far as the recording tells
+
+
+ALONE = Whose()
+
+
+def in_files(name: str) -> str:
+    """An address or a topic as a part of the name of a file."""
+    return re.sub(r"[^\w.]+", "_", name).strip("_")
+
+
 class Lidar(NamedTuple):
     """What sends most packets of those that are neither a Velodyne's nor an Ouster's."""
 
     row: Format | MemsFormat | None  # the format of its packets; None: Livox
     senders: list[str]  # of these makers, as `packets.sender_names` calls them
     first: str  # address and port of the one with the most packets
+    alike: Sequence[str] = ()  # those of which a calibration beside the capture may be, by the number of its lasers
+
+    def whose(self, sender: str | None) -> Whose:
+        """What the calibration of a sender is called after; None: of the first."""
+        address = self.first.rpartition(":")[0]
+        return Whose(sender or (address if address in self.senders else self.first), self.senders, self.alike)
 
 
 class Senders:
@@ -114,10 +137,20 @@ class Senders:
             return None
         if kind in self._rows or kind == _LIVOX:
             (address, port), _ = sources[kind].most_common(1)[0]
-            return Lidar(self._rows.get(kind), names, f"{address}:{port}")
+            row = self._rows.get(kind)
+            return Lidar(row, names, f"{address}:{port}", [] if row is None else self._alike(row))
         if any(other in (_VELODYNE, _OUSTER) for other, _ in self._counts):
             return None
         raise PointsError(not_decoded(kind))
+
+    def _alike(self, row: Format | MemsFormat) -> list[str]:
+        """The senders whose calibrations are files as that of a format."""
+        from .spinning_packets import Format  # numba
+
+        if not isinstance(row, Format):
+            return []
+        like = {name for name, other in self._rows.items() if isinstance(other, Format) and other.shares_files(row)}
+        return self._names(like.__contains__)
 
 
 def not_decoded(name: str) -> str:

@@ -66,6 +66,15 @@ class Format(NamedTuple):
         return self.clock.kind == "hesai"
 
     @property
+    def n_lasers(self) -> int:
+        """Rows of a calibration."""
+        return self.lasers or self.n_channels
+
+    def shares_files(self, other: Format) -> bool:
+        """Whether a calibration of one can be read as that of the other."""
+        return (self.is_hesai, self.spins, self.n_lasers) == (other.is_hesai, other.spins, other.n_lasers)
+
+    @property
     def block_bytes(self) -> int:
         """From one block to the next."""
         return self.first + self.n_channels * self.channel_bytes
@@ -295,7 +304,7 @@ def angles_of_difop(row: Format, payload: memoryview) -> Angles | None:
         lasers = np.stack([elevation, np.zeros(16)], axis=1)
         is_set = not np.isin(content[1165:1169], (0, 255)).all()
     else:
-        n = row.lasers or row.n_channels
+        n = row.n_lasers
         per_list = 128 if row.header == 80 else 32 if n <= 32 else 96
         triples = content[468 : 468 + 6 * per_list].reshape(2, per_list, 3)[:, :n].astype(np.float64)
         lasers = (0.01 * (triples[..., 1:] @ [256.0, 1.0]) * np.where(triples[..., 0] > 0, -1.0, 1.0)).T
@@ -322,7 +331,7 @@ def has_16_lasers(payload: memoryview) -> bool:
 
 def read_angles(path: Path | Told, row: Format) -> Angles:
     """The angles of a calibration file: ``channel,elevation,azimuth`` as Hesai's, or, without channel, RoboSense's."""
-    n = row.lasers or row.n_channels
+    n = row.n_lasers
     rows = []
     for line in path.read_bytes()[: 1 << 20].decode("utf-8-sig", "replace").splitlines():
         try:
@@ -441,6 +450,8 @@ class SpinningStream:
         # A Ruby counts microseconds by its manual, and nanoseconds by its maker's driver.
         if row.header == 80 and int.from_bytes(payload[row.clock.at + 6 : row.clock.at + 10], "big") >= 10**6:
             row = self._row = row._replace(clock=Clock("nanoseconds", row.clock.at))
+            # In the first millisecond of a second, both look alike.
+            self._packets = [each._replace(time_s=time_of(row, memoryview(each.content))) for each in self._packets]
         azimuths = np.array(self.azimuths_of(payload))
         speed_at = row.clock.speed_at
         rpm = row.rpm * struct.unpack_from("<H", payload, speed_at)[0] if speed_at else self._angles.rpm

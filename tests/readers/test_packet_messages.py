@@ -279,6 +279,32 @@ def test_packets_of_other_drivers_give_the_turns_of_a_capture(tmp_path: Path, na
             next(iter(read_scans(bare)))
 
 
+def test_each_topic_of_packets_has_its_own_calibration(tmp_path: Path) -> None:
+    """The angles of one sensor were those of the other, too."""
+    driver, topics = Driver("hesai_ros_driver, short", 2), ["/front/packets", "/rear/packets"]
+    files = [tmp_path / "a_front_packets.csv", tmp_path / "a_rear_packets.csv"]
+    sent = []
+    for topic, name in zip(topics, ("ot128", "jt128"), strict=True):
+        model = MODELS[name]
+        packets = packets_of(model, blocks_of(model, *ranges(model, round(450 / model.step_deg))))
+        sent.append((topic, driver.kind, "cdr", split(packets, 37, driver.message)))
+    path = mcap_of(tmp_path / "a.mcap", sent, 10**6)
+    (tmp_path / "a.csv").write_text(calibration(unit_angles(MODELS["jt128"])))
+    for topic, file in zip(topics, files, strict=True):
+        for read in (lambda t: next(iter(read_scans(path, topic=t))), lambda t: sensor_of(path, topic=t)):
+            with pytest.raises(PointsError, match=rf"a\.csv does not say of which sensor .* as {file.name}"):
+                read(topic)
+    for topic, file, name in zip(topics, files, ("ot128", "jt128"), strict=True):
+        file.write_text(calibration(unit_angles(MODELS[name])))
+        sensor = sensor_of(path, topic=topic)
+        assert sensor is not None
+        assert sensor.name == name
+        up_deg = max(
+            np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))).max() for _, p in read_scans(path, topic=topic)
+        )
+        assert up_deg == pytest.approx(sensor.fov_up_deg, abs=0.01)
+
+
 @cache
 def one_message(name: str) -> tuple[str, list[bytes], bytes]:
     """Its type, packets and bytes."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_writers import check_same, let_overtake, vlp16_packets, write_link, write_pcap
+from capture_writers import check_same, join, let_overtake, vlp16_packets, write_link, write_pcap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_writers import MODELS, T0_S, Model, blocks_of, calibration, difop, expected, packets_of, ranges, unit_angles
 from numpy.typing import NDArray
-from test_captures import check_beside, error_of
+from test_captures import check_beside, check_told_apart, error_of
 
 import twins.packets
 from edgeperc import PointsError, read_timed_scans, sensor_of
@@ -113,6 +113,39 @@ def test_what_is_written_is_read(tmp_path: Path, model: Model) -> None:
     assert sensor.name == model.name
     assert sensor.elevations_deg == tuple(sorted(unit_angles(model)[:, 0].tolist(), reverse=True))
     assert sensor.columns == round(360 / model.step_deg) * (2 if model.second == "firing" else 1)
+
+
+@pytest.mark.parametrize("name", ["ruby-plus-48", "rs-ruby-128"])
+def test_a_second_begins_with_a_millisecond_in_either_unit(tmp_path: Path, name: str) -> None:
+    """Nanoseconds, and, of an RS-Ruby, microseconds."""
+    model = MODELS[name]
+    path, _ = capture(tmp_path, model, 450)
+    (scan,) = read_timed_scans(path)
+    assert scan.times_s is not None
+    assert scan.times_s.max() - scan.times_s.min() < 0.1
+
+
+def test_each_of_several_sensors_has_its_own_calibration(tmp_path: Path) -> None:
+    """The angles of one were those of the other, too, whose packets are alike."""
+    sent = {}
+    for name, address in (("ot128", "192.168.1.201"), ("jt128", "192.168.1.202")):
+        model = MODELS[name]
+        packets = packets_of(model, blocks_of(model, *ranges(model, round(90 / model.step_deg))))
+        sent[address] = write_link(tmp_path / f"{name}.pcap", 1, packets, one=address)
+        (tmp_path / f"{name}.csv").write_text(calibration(unit_angles(model)))
+    both = join(tmp_path / "both.pcap", sent.values())
+    assert "as both_192.168.1.202.csv" in error_of(both, topic="192.168.1.202")
+    (tmp_path / "both.csv").write_text(calibration(unit_angles(MODELS["jt128"])) + "d41d8cd98f00b204e9800998ecf8427e\n")
+    for address in sent:
+        said = error_of(both, topic=address)
+        assert f"both.csv does not say of which sensor it is, {' or '.join(sent)}" in said
+        assert f"as both_{address}.csv" in said
+    for address, alone in sent.items():
+        (tmp_path / f"both_{address}.csv").write_text(alone.with_suffix(".csv").read_text())
+    check_told_apart(both, sent)
+    (tmp_path / "both.csv").unlink()
+    (tmp_path / "both_192.168.1.202.csv").unlink()
+    assert "are not known" in error_of(both, topic="192.168.1.202")  # that of another one is not taken
 
 
 @pytest.mark.parametrize("name", ["pandarxt-16", "pandar64", "rs-16", "rs-airy", "helios-32"])
