@@ -121,6 +121,8 @@ class Match(NamedTuple):
     name: str = ""
     off_deg: float = 0.0
     part_of: str = ""
+    also: str = ""  # the shorter one
+    open_way: float = 0.0  # which way up it is, if its lowest beams are not among them; 0: they are
 
 
 @dataclass(frozen=True)
@@ -190,9 +192,10 @@ def estimate_sensor(scans: Sequence[Points]) -> SensorEstimate:
         explained = f"{len(beams.slopes)} explain {max(on_beams, 0.0):.0%} of them"
         return _beamless(polar, _remission_range(np.concatenate([scan[:, 3] for scan in clean])), explained)
     if match.part_of:
+        also = f" or the {SENSORS[match.also].n_beams} of the {match.also}" if match.also else ""
         raise _unknown(
-            f"it has {len(beams.slopes)} of the {SENSORS[match.part_of].n_beams} beams of the {match.part_of}: a part "
-            "of a scan, if it is of that sensor"
+            f"it has {len(beams.slopes)} of the {SENSORS[match.part_of].n_beams} beams of the {match.part_of}{also}: a "
+            "part of a scan, if it is of that sensor"
         )
     if not match.name and np.median(beams.flat_m) < _NEAR_ALL_M:
         raise _unknown(
@@ -671,8 +674,13 @@ def _match(beams: Beams) -> Match:
                 # Beams above them may meet nothing but the sky.
                 has_lowest = way > 0.0 and nearest.max() >= len(known) - 2
                 is_whole = n >= _SEEN * (len(known) - int(nearest.min()) * has_lowest)
-                found.append(Match(name, error_deg) if is_whole else Match(part_of=name, off_deg=error_deg))
-    return min(found[1:] or found, key=lambda each: (not each.name, each.off_deg))
+                open_way = way if nearest.max() < len(known) - 2 else 0.0
+                whole, part_of = (name, "") if is_whole else ("", name)
+                found.append(Match(whole, error_deg, part_of, open_way=open_way))
+    best = min(found[1:] or found, key=lambda each: (not each.name, each.off_deg))
+    # A Helios-16P's beams are the upper half of a Helios': where none of the lower ones is seen, it may be either.
+    longer = (each for each in found if each.part_of and best.open_way == each.open_way != 0.0)
+    return next((each._replace(also=best.name) for each in longer if each.off_deg <= best.off_deg), best)
 
 
 def _is_above(beams: Beams, way: float) -> bool:

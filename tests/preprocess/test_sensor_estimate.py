@@ -188,6 +188,17 @@ TURN = np.arange(N) * 0.137
 CONE = np.radians(35.0) * np.cos(TURN)
 
 
+@pytest.mark.parametrize("name", ["helios-16", "helios-32"])
+def test_beams_of_two_sensors_are_neither(name: str) -> None:
+    """The upper half of a Helios' beams are a Helios-16P's: hung in a field, where the others meet nothing, either."""
+    hung = -np.array(SENSORS[name].elevations_deg)
+    scan = spinning(hung[hung < 2.0], columns=1800)
+    with pytest.raises(SensorError, match="of the 32 beams of the helios-32 or the 16 of the helios-16: a part"):
+        estimate_sensor([scan])
+    found = estimate_sensor([spinning(hung, columns=1800)])  # a wall shows the others
+    assert found.profile.name == name
+
+
 def voxels(scan: Points, size_m: float) -> Points:
     """The middle of the points in each cube."""
     _, cell, count = np.unique(
