@@ -191,7 +191,15 @@ def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     if {"tag", "line"} <= {*fields}:  # of Livox' drivers alone
         raise of_livox()
     source = f"topic {topic}, frame {frame!r}, fields {', '.join(fields)}"
-    makers = {maker for maker, pattern in _MAKERS.items() if re.search(pattern, words)}
+    of_makers = {
+        maker: [profile for name, profile in SENSORS.items() if name.startswith(names)]
+        for maker, names in _PREFIXES.items()
+    }
+    makers = {
+        maker
+        for maker, profiles in of_makers.items()
+        if re.search("|".join([_MAKERS[maker], *(_pattern(profile.name) for profile in profiles)]), words)
+    }
     if is_ouster_cloud(fields):
         makers.add("ouster")
     elif not makers and {"intensity", "ring", "time"} <= set(fields):  # converters of other sensors write these too
@@ -199,7 +207,7 @@ def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     if len(makers) != 1:
         raise SensorError(f"the point clouds do not name their sensor ({source}). {_CHOICES}")
     (maker,) = makers
-    of_maker = [profile for name, profile in SENSORS.items() if name.startswith(_PREFIXES[maker])]
+    of_maker = of_makers[maker]
     named = [profile for profile in of_maker if re.search(_pattern(profile.name), words)]
     if rings:
         fitting = _ouster_by_rings(rings, of_maker) if maker == "ouster" else _by_rings(rings, of_maker)

@@ -226,6 +226,8 @@ def test_clouds_are_recognized_by_their_rings(name: str, from_top: bool) -> None
         (described(["x", "y", "z", "intensity"], "os1_64"), "os1-64"),
         (described(VELODYNE_FIELDS, "pandar", rings=beams("pandar64")), "pandar64"),
         (described(VELODYNE_FIELDS, "velodyne", "/vlp_16", beams("vlp-16")), "vlp-16"),
+        (described(["x", "y", "z", "intensity"], "jt128_front_link", "/jt128/front/points"), "jt128"),
+        (described(VELODYNE_FIELDS, "helios_32", rings=beams("helios-32")), "helios-32"),
     ],
 )
 def test_clouds_are_recognized_by_words(found: dict[str, Any], name: str) -> None:
