@@ -291,7 +291,7 @@ def test_files_that_are_not_images(tmp_path: Path, image: NDArray[np.uint8]) -> 
             edgeperc.read_image(path)
         assert str(path) in str(caught.value)
     for missing in (tmp_path / "none", tmp_path, "a\0b"):
-        with pytest.raises(ImageError, match=r"no such file|cannot be read"):
+        with pytest.raises(ImageError, match=r"no such file|cannot be read|expected a path without a null character"):
             edgeperc.read_image(missing)
 
 

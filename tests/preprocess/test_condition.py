@@ -221,7 +221,7 @@ def test_rendering_uses_the_profiles_range() -> None:
 
 def test_built_in_functions_match_their_source() -> None:
     functions = {name: profile.remission for name, profile in SENSORS.items() if profile.remission}
-    assert set(functions) == {"hdl-32e", "vlp-16", "vlp-32c", "pandar64"}
+    assert set(functions) == {"hdl-32e", "vlp-16", "vlp-16-hi-res", "vlp-32c", "vls-128", "pandar64"}
     for function in functions.values():
         assert function.kind == "logarithm"
         assert (function.to, function.full_scale) == ("hdl-64e", 255.0)

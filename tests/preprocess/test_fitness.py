@@ -7,6 +7,7 @@ import csv
 import json
 import pickle
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -23,6 +24,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 import twins.fitness
+from edgeperc import Perceiver
 from edgeperc.errors import CardError, MountingError, PointsError
 from edgeperc.ground.leveling import MountingEstimator, near_support, share_below
 from edgeperc.preprocess.condition import condition
@@ -90,7 +92,17 @@ def test_a_finding_is_its_sentence() -> None:
     assert not Finding("few rows").gross
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_sensor_whose_beams_all_look_up_is_to_hang() -> None:
+    hung = replace(get_sensor("rs-bpearl"), mounting=Mounting(1.8, roll_deg=180.0, pitch_deg=0.0))
+    hung = replace(hung, remission_range=(0.0, 1.0))
+    assert any("another field of view" in sentence for sentence in gross(street(0, "rs-bpearl"), "rs-bpearl"))
+    perceive = Perceiver("pointseg", sensor=hung, mounting=hung.mounting, on_mismatch="refuse")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert perceive(simulate(random_scene(0), hung, 0).points).points is not None
+
+
+@pytest.mark.parametrize("sensor", [name for name in SENSORS if name != "rs-bpearl"])
 def test_simulated_scans_of_every_built_in_sensor_are_accepted(sensor: str) -> None:
     points = scanned(0, sensor)
     assert gross(street(0, sensor), sensor) == []
