@@ -100,6 +100,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker("kernel")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Networks start with the same weights, whatever test ran before: torch draws others in each process."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
+
+
 def pytest_testnodedown(node: Any) -> None:
     """Of pytest-xdist: what a worker process called. One that died has no output; pytest-xdist names its test."""
     node.config.stash.setdefault(CALLED, set()).update(getattr(node, "workeroutput", {}).get("called", ()))

@@ -261,7 +261,8 @@ def check_logits(lowest: float, highest: float, what: str, advice: str) -> None:
     """
     if lowest >= 0.0 and 0.0 < highest <= MAX_PROBABILITY:
         raise InferenceError(
-            f"{what} are {lowest:g} to {highest:g}, as after a sigmoid; expected logits, most of them below 0. {advice}"
+            f"{what} are {lowest:g} to {highest:g}, as after a sigmoid or without training; expected logits, most of "
+            f"them below 0. {advice}"
         )
 
 
