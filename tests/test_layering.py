@@ -102,6 +102,8 @@ FLOORS = {
         view.__init__
         datasets.__init__ datasets.annotations datasets.images datasets.pickled datasets.splits
         datasets.kitti datasets.layout
+        datasets.tree
+        datasets.kitti_trees
         datasets.trees
         datasets.scan_folder
         live warm_up

@@ -36,7 +36,7 @@ from .arguments import (
 from .output import make_folder, make_places, print_error, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Report
-from .scan_times import times_of, warn_of_rate
+from .scan_times import times_of, times_of_set, warn_of_rate
 from .scans import (
     Scans,
     Sensors,
@@ -78,6 +78,7 @@ if TYPE_CHECKING:
 
 
 _KINDS = ("png", "html", "labels", "ply")
+_RATE_HZ = 10.0  # of files without times, unless --rate says another one
 _BETWEEN_DRIVES_S = 100.0  # more than the 60 s over which a tracker remembers its tracks
 
 
@@ -198,11 +199,17 @@ def add_parser(commands: Commands) -> None:
         "replay one PATH in real time; always take the newest scan and drop older ones that still wait (default for "
         "ports, without files of each scan, --gif, --deskew and --consistency)",
     )
-    live("--rate HZ", "scans per second of files without time stamps (default: 10)", type=positive_number, default=10.0)
+    live(
+        "--rate HZ",
+        "scans per second of files without time stamps (default: 10)",
+        type=positive_number,
+        default=_RATE_HZ,
+    )
     live(
         "--times FILE",
         "times of the scan files of one drive: a line of seconds, or of a date with a time, for each scan, or for each "
-        "number in their names from 0 on, as KITTI's timestamps.txt and times.txt (default: as --rate says)",
+        "number in their names from 0 on, as KITTI's timestamps.txt and times.txt (default: with --track, of such a "
+        "file beside their folder; else as --rate says)",
         type=Path,
     )
 
@@ -256,7 +263,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     check_scan_files(arguments, scans)
     times = {} if arguments.times is None else times_of(arguments.times, scans)
     if arguments.track and not (images or arguments.live or arguments.deskew or times):
-        warn_of_rate(scans, arguments)
+        times = times_of_set(scans) if arguments.rate == _RATE_HZ else {}
+        warn_of_rate([scan for scan in scans if scan not in times], arguments)
     names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     check_outputs(arguments, kinds, images, scans, targets)

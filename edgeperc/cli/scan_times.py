@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 from ..errors import EdgepercError, StampError
 from ..system.printable import many
 from ..system.remote import Remote
+from .output import print_line
 from .scans import TIME_IN_NAME, is_recording, reading_options
 
 if TYPE_CHECKING:
@@ -41,6 +43,28 @@ def times_of(file: Path, scans: Sequence[Path | Remote]) -> dict[Path | Remote, 
             "or, of scans with numbers as names, a line for each number from 0 on"
         )
     return {scan: times_s[number] for scan, number in zip(scans, numbers, strict=True)}
+
+
+def times_of_set(scans: Sequence[Path | Remote]) -> dict[Path | Remote, float]:
+    """The times of scan files that lie as in KITTI's raw and odometry data or in KITTI-360: of the file of times beside
+    their folder, which is told. A warning says why a file is not taken.
+    """
+    folders: dict[Path | Remote, list[Path | Remote]] = {}
+    for scan in scans:
+        folders.setdefault(scan.parent, []).append(scan)
+    times_s: dict[Path | Remote, float] = {}
+    for folder, files in folders.items():
+        name = _TIMES_BESIDE.get(folder.name)
+        if name is not None and isinstance(folder, Path) and (beside := folder.absolute().parent / name).is_file():
+            try:
+                times_s |= times_of(beside, files)
+                print_line(f"scans of {folder} have the times of {beside}", sys.stderr)
+            except (OSError, StampError) as exc:
+                warnings.warn(f"--track: {folder}: the times beside the scans are not taken: {exc}", stacklevel=2)
+    return times_s
+
+
+_TIMES_BESIDE = {"data": "timestamps.txt", "velodyne": "times.txt"}  # by the name of the scans' folder
 
 
 def _read_times(file: Path) -> list[float]:

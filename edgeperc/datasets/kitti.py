@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -163,9 +163,13 @@ def label_lines(path: Path) -> list[tuple[int, str]]:
 
 def read_labels(path: Path) -> KittiLabels:
     """Read the rows of a KITTI label file, copies once: nothing can find both. PointsError, which names the line."""
+    return labels_of([(number, line.split()) for number, line in label_lines(path)], path)
+
+
+def labels_of(lines: Iterable[tuple[int, Sequence[str]]], path: Path) -> KittiLabels:
+    """The labels of one scan among the lines of a file, by their numbers: a class, and 14 values. As `read_labels`."""
     rows: dict[tuple[str, tuple[float, ...]], None] = {}
-    for number, line in label_lines(path):
-        words = line.split()
+    for number, words in lines:
         try:
             values = [float(word) for word in words[1:15]]
         except ValueError as exc:
@@ -362,6 +366,27 @@ SEQUENCE_DRIVES = {
     "08": "2011_09_30_drive_0028",
     "09": "2011_09_30_drive_0033",
     "10": "2011_09_30_drive_0034",
+}
+
+# Raw drive of each tracking sequence, of those whose number of frames tells it.
+TRACKING_DRIVES = {
+    "0000": "2011_09_26_drive_0005",
+    "0001": "2011_09_26_drive_0009",
+    "0002": "2011_09_26_drive_0011",
+    "0003": "2011_09_26_drive_0013",
+    "0004": "2011_09_26_drive_0014",
+    "0005": "2011_09_26_drive_0015",
+    "0006": "2011_09_26_drive_0018",
+    "0007": "2011_09_26_drive_0022",
+    "0008": "2011_09_26_drive_0032",
+    "0009": "2011_09_26_drive_0036",
+    "0010": "2011_09_26_drive_0056",
+    "0011": "2011_09_26_drive_0059",
+    "0012": "2011_09_26_drive_0060",
+    "0013": "2011_09_26_drive_0091",
+    "0018": "2011_09_29_drive_0004",
+    "0019": "2011_09_29_drive_0071",
+    "0020": "2011_10_03_drive_0047",
 }
 
 

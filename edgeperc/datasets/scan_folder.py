@@ -57,10 +57,12 @@ from .layout import (
     read_layout,
     tells_parts,
 )
-from .trees import TREES, Tree
+from .tree import Camera, Labeled, Tree
+from .trees import TREES
 
 __all__ = ["ScanFolder", "ScanFrame"]
 
+_KITTI_LABELS = ("label_02", "label_2")  # of sets in their own tree, some of which have a folder velodyne
 LABEL_FOLDERS = ("label", "label_2", "labels", "semseg", "drivable")
 MARGIN_M = 0.05  # a label box is often a little smaller than its object
 
@@ -214,7 +216,8 @@ class ScanFolder:
         self._point_numbers: Bytes | None = None
         self._tree: Tree | None = None
         self._names_file = "semseg_classes.json"
-        if self.layout.files in TREES and (self.root / "velodyne").is_dir():
+        in_tree = not (self.root / "velodyne").is_dir() or any((self.root / name).is_dir() for name in _KITTI_LABELS)
+        if self.layout.files in TREES and not in_tree:
             self.layout = replace(self.layout, files="plain")
         if self.layout.files in TREES:
             self._tree = TREES[self.layout.files](self.root)
@@ -253,28 +256,34 @@ class ScanFolder:
         if name not in self.drives:
             some = ", ".join(map(repr, islice(self.drives, 3)))
             raise PointsError(f"{self.root} has no labeled scan {name!r}; it has {len(self.drives)}: {some}, …")
-        if self._tree is not None:
-            points, labeled, numbers, polygons = self._tree.read(name)
-            checked = None if labeled is None else self._checked(labeled, self.scans[name])
-            of_points = None if numbers is None else self._classes_of(numbers, self.scans[name])
-            return ScanFrame(name, self.drives[name], self.layout, points, checked, of_points, polygons)
-        points = read_points(self.scans[name])
-        calibration = unlabeled = boxes = image_labels = None
-        path = self._path("boxes", name)
+        points, labeled, numbers, drivable, camera = self._read(name) if self._tree is None else self._tree.read(name)
+        path = self._path("boxes", name) or self.scans[name]
+        boxes = None if labeled is None else self._checked(labeled, path)
+        classes = None if numbers is None else self._classes_of(numbers, self._path("points", name) or self.scans[name])
+        calibration = unlabeled = image_labels = None
+        if camera is not None:
+            calibration, unlabeled, rows = camera
+            if rows is not None:
+                kinds = [
+                    k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds
+                ]
+                image_labels = kitti.KittiLabels(tuple(kinds), rows.numbers)
+        of_image = calibration, unlabeled, image_labels
+        return ScanFrame(name, self.drives[name], self.layout, points, boxes, classes, drivable, *of_image)
+
+    def _read(self, name: str) -> Labeled:
+        """Read a scan of the plain layout."""
+        points, boxes, camera = read_points(self.scans[name]), None, None
+        path, classes, area = (self._path(kind, name) for kind in ("boxes", "points", "drivable"))
         if path is not None and self.layout.box_format == "kitti":
             found, unlabeled, calibration, rows = kitti.read_labeled(
                 self.root, name, self.layout.image_size or kitti.IMAGE_SIZE
             )
-            boxes = self._renamed(found, path)
-            kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
-            image_labels = kitti.KittiLabels(tuple(kinds), rows.numbers)
+            boxes, camera = [*found], Camera(calibration, unlabeled, rows)
         elif path is not None:
-            boxes = self._checked(self._read_boxes(path, name), path)
-        classes, area = self._path("points", name), self._path("drivable", name)
-        point_classes = None if classes is None else self._classes_of(kitti.read_numbers(classes, len(points)), classes)
-        drivable = None if area is None else _read_polygons(area)
-        of_image = calibration, unlabeled, image_labels
-        return ScanFrame(name, self.drives[name], self.layout, points, boxes, point_classes, drivable, *of_image)
+            boxes = self._read_boxes(path, name)
+        numbers = None if classes is None else kitti.read_numbers(classes, len(points))
+        return Labeled(points, boxes, numbers, None if area is None else _read_polygons(area), camera)
 
     def _path(self, kind: str, name: str) -> Path | None:
         """The label file of a scan: boxes, points or drivable; None if the scan has none."""

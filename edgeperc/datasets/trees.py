@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -18,11 +17,13 @@ from ..readers.files import read_points
 from ..system.extras import require
 from ..types.frame import poses_of, turned
 from ..types.perception import Box
-from ..types.points import Floats, Points
+from ..types.points import Floats
 from .annotations import read_json
 from .kitti import read_numbers
+from .kitti_trees import KittiRaw, KittiTracking, ViewOfDelft
 from .layout import WITH_RIDER, point_names_of
 from .pickled import read_pickled
+from .tree import Labeled, Tree, present
 
 _Row = TypeVar("_Row")
 _Json = dict[str, Any]
@@ -32,28 +33,6 @@ _Posed = tuple[str, Floats, list[float]]  # class, pose, and width, length and h
 _TOP = "LIDAR_TOP"
 _PLACE, _TURN = ("tx_m", "ty_m", "tz_m"), ("qx", "qy", "qz", "qw")
 _BYTE = 255.0  # Argoverse 2's intensities, which its profile has as 0..1
-
-
-class Labeled(NamedTuple):
-    """A scan with x ahead, and what its set says of it; None where it says nothing."""
-
-    points: Points
-    boxes: list[Box] | None  # with the classes of the set
-    numbers: NDArray[Any] | None  # of the points' classes
-    drivable: tuple[Floats, ...] | None
-
-
-class Tree:
-    """The labeled scans of a set: their files and drives by name, and the names of points' classes by number."""
-
-    scans: dict[str, Path]
-    drives: dict[str, str]
-    point_names: Mapping[int, str]
-    names_file = "category.json"  # of ``point_names``
-
-    def read(self, name: str) -> Labeled:
-        """Read a scan and its labels. Raises PointsError."""
-        raise NotImplementedError
 
 
 class NuScenes(Tree):
@@ -82,7 +61,7 @@ class NuScenes(Tree):
             tokens = {frame.token for frame, _ in self._frames.values()}
             files = self._rows("lidarseg", lambda row: (_text(row["sample_data_token"]), _text(row["filename"])))
             of = {token: self._root / file for token, file in files if token in tokens}
-            self._numbers = _present(of, self._root, "files of lidarseg.json", all_may_lack=True)
+            self._numbers = present(of, self._root, "files of lidarseg.json", all_may_lack=True)
         if self._boxes is None and not self._numbers:
             raise PointsError(f"{self._tables} has no labels; expected rows in sample_annotation.json or lidarseg.json")
 
@@ -127,7 +106,7 @@ class NuScenes(Tree):
             if channel == of_channel and named.setdefault(_stem(frame.filename), (frame, pose))[0] is not frame:
                 raise PointsError(f"{self._tables}: two key frames are called {_stem(frame.filename)}; expected one")
         files = {name: self._file(frame.filename) for name, (frame, _) in named.items()}
-        there = _present(files, self._root, "labeled scans")
+        there = present(files, self._root, "labeled scans")
         return {name: named[name] for name in there}, there
 
     def _file(self, name: str) -> Path:
@@ -204,7 +183,7 @@ class Argoverse2(Tree):
             for log in sorted(logs)
             for stamp in np.unique(_feather(log / "annotations.feather", "timestamp_ns")["timestamp_ns"]).tolist()
         }
-        self.scans = _present(files, root, "labeled scans")
+        self.scans = present(files, root, "labeled scans")
         self.drives = {name: path.parents[2].name for name, path in self.scans.items()}
         self._log = lru_cache(maxsize=2)(_log)
 
@@ -348,18 +327,6 @@ def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
         raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc
 
 
-def _present(files: Mapping[str, Path], root: Path, what: str, *, all_may_lack: bool = False) -> dict[str, Path]:
-    """Those of the files that are there, as sets are downloaded in parts. Raises PointsError if none is."""
-    there = {name: path for name, path in files.items() if path.is_file()}
-    lacking = next((path for name, path in files.items() if name not in there), None)
-    told = f"{root}: of {len(files):,} {what} {len(there):,} are there, and not {lacking or 'more'}"
-    if not there and not all_may_lack:
-        raise PointsError(f"{told}; expected the set's files beside its tables")
-    if lacking:
-        warnings.warn(f"{told}; the others are left out", stacklevel=5)
-    return there
-
-
 def _folder_of_tables(root: Path) -> Path:
     """The folder of the tables of one version."""
     found = sorted(path.parent for depth in ("", "*/") for path in root.glob(f"{depth}sample_data.json"))
@@ -416,5 +383,12 @@ def _box(kind: str, pose: Floats, size: Iterable[float], into: Floats) -> Box:
     return Box(kind, 1.0, (x, y, z), (length, width, height), math.atan2(there[1, 0], there[0, 0]))
 
 
-TREES: Mapping[str, Callable[[Path], Tree]] = {"nuscenes": NuScenes, "argoverse2": Argoverse2, "pandaset": PandaSet}
+TREES: Mapping[str, Callable[[Path], Tree]] = {
+    "argoverse2": Argoverse2,
+    "kitti-raw": KittiRaw,
+    "kitti-tracking": KittiTracking,
+    "nuscenes": NuScenes,
+    "pandaset": PandaSet,
+    "vod": ViewOfDelft,
+}
 """What reads a set in its own tree, by ``files`` of its description."""

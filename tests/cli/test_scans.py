@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import tempfile
 import warnings
@@ -227,3 +228,33 @@ def test_scan_files_with_times_have_poses(tmp_path: Path, shell: Shell, monkeypa
     assert "the scan has no time, by which its pose is found; pass --times FILE" in shell.err("run", *tracked, code=1)
     (tmp_path / "drive.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
     assert "is of the scan files" in shell.err("run", tmp_path / "drive.pcap", "--times", tmp_path / "times.txt")
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("scans_in", "file", "lines"),
+    [
+        ("velodyne_points/data", "timestamps.txt", [f"2011-09-26 13:02:25.{k}00000000" for k in (1, 3, 5, 7)]),
+        ("velodyne", "times.txt", [f"{0.2 * k:e}" for k in range(4)]),
+    ],
+)
+def test_the_times_of_kitti_are_found(scans_in: str, file: str, lines: list[str], tmp_path: Path, shell: Shell) -> None:
+    """They lie beside the folder of the scans; without --track, or with another --rate, nothing needs them."""
+    drive = tmp_path / "2011_09_26_drive_0001_sync"
+    folder = drive / scans_in
+    folder.mkdir(parents=True)
+    for k in (0, 1, 3):
+        write_scan(folder / f"{k:010d}.bin")
+    beside = folder.parent / file
+    beside.write_text("\n".join(lines))
+    tracked = ["run", drive, "--json", "--anyway", "--track"]
+    said = shell.both(*tracked)
+    assert said.err.count(f"have the times of {beside}") == 1
+    stamps_s = [json.loads(line)["stamp_s"] for line in said.out.splitlines()]
+    np.testing.assert_allclose(np.diff(stamps_s), [0.2, 0.4], atol=1e-6)
+    for options in (tracked[:-1], [*tracked, "--rate", "5"]):
+        assert "have the times" not in shell.err(*options, code=0)
+    beside.write_text("\n".join(lines[:2]))
+    err = shell.err(*tracked, code=0)
+    assert "the times beside the scans are not taken" in err
+    assert "2 times for 3 scans" in err
