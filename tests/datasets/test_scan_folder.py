@@ -313,7 +313,7 @@ def test_folders_without_scans_labels_or_description(tmp_path: Path) -> None:
     with pytest.raises(PointsError, match=r"no scans\.json.*FOLDER:pandaset"):
         ScanFolder(tmp_path)
     with pytest.raises(PointsError, match="no scans; expected velodyne/NAME"):
-        ScanFolder(tmp_path, "vod")
+        ScanFolder(tmp_path, "ddad")
     with pytest.raises(PointsError, match="no labels for its scans"):
         ScanFolder(folder_of(tmp_path))
     for part in ("velodyne/000000.bin", "labels/0.label"):
@@ -584,7 +584,8 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 
 def test_descriptions_of_public_sets() -> None:
-    assert known_layouts() == ("av2", "ddad", "lyft", "nuscenes", "pandaset", "semantickitti", "vod")
+    kitti = ("kitti-raw", "kitti-tracking")
+    assert known_layouts() == ("av2", "ddad", *kitti, "lyft", "nuscenes", "pandaset", "semantickitti", "vod")
     for name in known_layouts():
         layout = read_layout(name)
         assert layout.name == name
