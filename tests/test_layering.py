@@ -100,9 +100,10 @@ FLOORS = {
         view.files view.page view.picture view.tracks
         view.painted
         view.__init__
-        datasets.__init__ datasets.annotations datasets.images datasets.pickled datasets.splits
+        datasets.__init__ datasets.annotations datasets.images datasets.parquet datasets.pickled datasets.splits
         datasets.kitti datasets.layout
         datasets.trees
+        datasets.once datasets.waymo
         datasets.scan_folder
         live warm_up
         perceiver

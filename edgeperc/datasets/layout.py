@@ -76,7 +76,7 @@ class ScanLayout:
     boxes: Mapping[str, str]
     points: Mapping[str, str]  # also ``drivable`` and the `PARTS` of the background
     # "semantickitti": its tree; scans are called SEQ/NAME. Those behind it: theirs, or the plain one
-    files: Literal["plain", "semantickitti", "nuscenes", "argoverse2", "pandaset"] = "plain"
+    files: Literal["plain", "semantickitti", "nuscenes", "argoverse2", "pandaset", "waymo", "once"] = "plain"
     # "plain": label/NAME.txt; others: `BOX_FILES`
     box_format: Literal["plain", "kitti", "labelcloud", "sustechpoints", "cvat"] = "plain"
     image_size: tuple[int, int] | None = None  # width and height [px], of "kitti" boxes; None: those of KITTI's images

@@ -12,7 +12,7 @@
 
 A scan is labeled if it has at least one of the three label files. ``layouts/`` next to this module has descriptions of
 public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
-``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``. With a name of `trees.TREES`, a folder
+``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``. With a name of `TREES`, a folder
 without ``velodyne`` is the root of that set, as it is downloaded.
 """
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -57,10 +57,20 @@ from .layout import (
     read_layout,
     tells_parts,
 )
-from .trees import TREES, Tree
+from .once import Once
+from .trees import Argoverse2, NuScenes, PandaSet, Tree
+from .waymo import Waymo
 
 __all__ = ["ScanFolder", "ScanFrame"]
 
+TREES: Mapping[str, Callable[[Path], Tree]] = {
+    "nuscenes": NuScenes,
+    "argoverse2": Argoverse2,
+    "pandaset": PandaSet,
+    "waymo": Waymo,
+    "once": Once,
+}
+"""What reads a set in its own tree, by ``files`` of its description."""
 LABEL_FOLDERS = ("label", "label_2", "labels", "semseg", "drivable")
 MARGIN_M = 0.05  # a label box is often a little smaller than its object
 

@@ -82,7 +82,7 @@ class NuScenes(Tree):
             tokens = {frame.token for frame, _ in self._frames.values()}
             files = self._rows("lidarseg", lambda row: (_text(row["sample_data_token"]), _text(row["filename"])))
             of = {token: self._root / file for token, file in files if token in tokens}
-            self._numbers = _present(of, self._root, "files of lidarseg.json", all_may_lack=True)
+            self._numbers = present(of, self._root, "files of lidarseg.json", all_may_lack=True)
         if self._boxes is None and not self._numbers:
             raise PointsError(f"{self._tables} has no labels; expected rows in sample_annotation.json or lidarseg.json")
 
@@ -127,7 +127,7 @@ class NuScenes(Tree):
             if channel == of_channel and named.setdefault(_stem(frame.filename), (frame, pose))[0] is not frame:
                 raise PointsError(f"{self._tables}: two key frames are called {_stem(frame.filename)}; expected one")
         files = {name: self._file(frame.filename) for name, (frame, _) in named.items()}
-        there = _present(files, self._root, "labeled scans")
+        there = present(files, self._root, "labeled scans")
         return {name: named[name] for name in there}, there
 
     def _file(self, name: str) -> Path:
@@ -204,7 +204,7 @@ class Argoverse2(Tree):
             for log in sorted(logs)
             for stamp in np.unique(_feather(log / "annotations.feather", "timestamp_ns")["timestamp_ns"]).tolist()
         }
-        self.scans = _present(files, root, "labeled scans")
+        self.scans = present(files, root, "labeled scans")
         self.drives = {name: path.parents[2].name for name, path in self.scans.items()}
         self._log = lru_cache(maxsize=2)(_log)
 
@@ -348,7 +348,7 @@ def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
         raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc
 
 
-def _present(files: Mapping[str, Path], root: Path, what: str, *, all_may_lack: bool = False) -> dict[str, Path]:
+def present(files: Mapping[str, Path], root: Path, what: str, *, all_may_lack: bool = False) -> dict[str, Path]:
     """Those of the files that are there, as sets are downloaded in parts. Raises PointsError if none is."""
     there = {name: path for name, path in files.items() if path.is_file()}
     lacking = next((path for name, path in files.items() if name not in there), None)
@@ -414,7 +414,3 @@ def _box(kind: str, pose: Floats, size: Iterable[float], into: Floats) -> Box:
     if not 0.0 < min(width, length, height) <= max(width, length, height) < math.inf:
         raise ValueError(f"a {kind!r:.60} of {width:g} x {length:g} x {height:g} m; expected sizes above 0")
     return Box(kind, 1.0, (x, y, z), (length, width, height), math.atan2(there[1, 0], there[0, 0]))
-
-
-TREES: Mapping[str, Callable[[Path], Tree]] = {"nuscenes": NuScenes, "argoverse2": Argoverse2, "pandaset": PandaSet}
-"""What reads a set in its own tree, by ``files`` of its description."""

@@ -584,7 +584,7 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 
 def test_descriptions_of_public_sets() -> None:
-    assert known_layouts() == ("av2", "ddad", "lyft", "nuscenes", "pandaset", "semantickitti", "vod")
+    assert known_layouts() == ("av2", "ddad", "lyft", "nuscenes", "once", "pandaset", "semantickitti", "vod", "waymo")
     for name in known_layouts():
         layout = read_layout(name)
         assert layout.name == name
