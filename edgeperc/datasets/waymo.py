@@ -61,6 +61,8 @@ class Waymo(Tree):
             for stamp in sorted(stamp for laser, stamp in frames if laser == _TOP):
                 self.scans[f"{segment}_{stamp}"] = self._files["lidar"][segment]
                 self.drives[f"{segment}_{stamp}"] = segment
+        if not self.scans:
+            raise PointsError(f"{root} has no labeled frame of TOP; expected rows with {_LASER} {_TOP} in lidar/")
 
     def read(self, name: str) -> Labeled:
         """Read a frame and its labels. Raises PointsError."""

@@ -193,6 +193,10 @@ Change = Callable[[dict[str, Table]], object]
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        (
+            lambda of: of["lidar"][LASER].__setitem__(slice(None), [REAR] * 4),
+            "has no labeled frame of TOP; expected rows",
+        ),
         (lambda of: of["lidar"].pop(f"{RANGES}.values"), r"lidar/.*cannot be read.*expected columns key\.laser_name"),
         (lambda of: of["lidar"][f"{RANGES}.shape"].__setitem__(3, [64, 1201, 3]), "3 channels; expected 4"),
         (lambda of: of["lidar"][f"{RANGES}.shape"].__setitem__(3, [64, 1200, 4]), "cannot reshape"),
