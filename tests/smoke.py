@@ -27,7 +27,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
         ["tests/export/test_database.py", "-k", "not ray"],
     ),
     "export": (["torch", "onnx", "onnxscript"], ["tests/export/test_networks.py", "tests/export/test_losses.py"]),
-    "argoverse": (["pyarrow"], ["tests/datasets/test_trees.py", "-k", "logs"]),
+    "argoverse": (["pyarrow"], ["tests/datasets/test_trees.py", "tests/datasets/test_waymo.py", "-k", "logs or waymo"]),
     "foxglove": (["foxglove"], ["tests/sinks/test_viewers.py", "-k", "foxglove or mcap"]),
     "geometry": (["open3d", "pypatchworkpp", "sklearn"], ["tests/bench/test_peers.py", "-k", "ground"]),
     "gpu": (["onnxruntime"], ["tests/inference/test_session.py"]),

@@ -100,10 +100,10 @@ FLOORS = {
         view.files view.page view.picture view.tracks
         view.painted
         view.__init__
-        datasets.__init__ datasets.annotations datasets.images datasets.pickled datasets.splits
+        datasets.__init__ datasets.annotations datasets.images datasets.parquet datasets.pickled datasets.splits
         datasets.kitti datasets.layout
         datasets.tree
-        datasets.kitti_trees
+        datasets.kitti_trees datasets.once datasets.waymo
         datasets.trees
         datasets.scan_folder
         live warm_up

@@ -62,7 +62,9 @@ def scan_folders(root: Path) -> list[Path]:
     return [folder for folder in folders if folder.is_dir() and scan_files(folder)]
 
 
-# Where PandaSet and Argoverse 2 have scans, which are not read here.
+# Public sets whose x is not ahead.
+_TURNED = {"nuscenes": ("nuScenes'", "right", -90), "once": ("ONCE's", "left", 90)}
+# Where PandaSet, Waymo and Argoverse 2 have scans, which are not read here.
 _UNREAD = ("lidar", "*/lidar", "sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar")
 
 
@@ -408,10 +410,11 @@ def check_sensor(arguments: argparse.Namespace) -> None:
 
     get_sensor(with_mounting(stated_sensor(arguments), arguments))
     file, given = getattr(arguments, "extrinsic", None), _given(arguments)
-    if arguments.sensor == "nuscenes" and file is None and getattr(arguments, "turn", None) is None:
+    if arguments.sensor in _TURNED and file is None and getattr(arguments, "turn", None) is None:
+        published, side, turn = _TURNED[arguments.sensor]
         warnings.warn(
-            "--sensor nuscenes: as published, x of nuScenes' scans points to the right, and x is taken for ahead; pass "
-            "--turn -90, or --turn 0 for scans that were turned",
+            f"--sensor {arguments.sensor}: as published, x of {published} scans points to the {side}, and x is taken "
+            f"for ahead; pass --turn {turn}, or --turn 0 for scans that were turned",
             stacklevel=2,
         )
     if file is None or not given:

@@ -25,7 +25,7 @@ def read_labelcloud(path: Path) -> list[Box]:
         raise PointsError(f"{settings} has format {known!r:.40}; save the labels as centroid_rel or centroid_abs")
     with _holding(path, "labels of labelCloud"):
         return [
-            _box(
+            upright_box(
                 item["name"],
                 [item["centroid"][axis] for axis in "xyz"],
                 [item["dimensions"][name] for name in ("length", "width", "height")],
@@ -39,7 +39,7 @@ def read_sustechpoints(path: Path) -> list[Box]:
     """Read ``label/NAME.json`` of SUSTechPOINTS. Parameters, results and errors as in `read_labelcloud`."""
     with _holding(path, "labels of SUSTechPOINTS"):
         return [
-            _box(item["obj_type"], *([item["psr"][part][axis] for axis in "xyz"] for part in _PSR))
+            upright_box(item["obj_type"], *([item["psr"][part][axis] for axis in "xyz"] for part in _PSR))
             for item in read_json(path, list)
         ]
 
@@ -56,7 +56,9 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
             if name in boxes:
                 raise PointsError(f"{path} has two scans called {name}; expected one")
             boxes[name] = [
-                _box(names[annotation["label_id"]], annotation["position"], annotation["scale"], annotation["rotation"])
+                upright_box(
+                    names[annotation["label_id"]], annotation["position"], annotation["scale"], annotation["rotation"]
+                )
                 for annotation in item["annotations"]
                 if annotation["type"] == "cuboid_3d" and not annotation.get("attributes", {}).get("outside", False)
             ]
@@ -93,7 +95,8 @@ def _angle(value: float, known: str) -> float:
     return value
 
 
-def _box(name: str, center: Any, size: Any, rotation: Any) -> Box:
+def upright_box(name: str, center: Any, size: Any, rotation: Any) -> Box:
+    """A box of its center, (length, width, height), and roll, pitch and yaw. Raises TypeError, ValueError."""
     (x, y, z), (length, width, height) = (map(float, values) for values in (center, size))
     roll, pitch, yaw = (math.remainder(float(angle), 2.0 * math.pi) for angle in rotation)
     numbers = x, y, z, length, width, height, roll, pitch, yaw

@@ -77,7 +77,16 @@ class ScanLayout:
     points: Mapping[str, str]  # also ``drivable`` and the `PARTS` of the background
     # "semantickitti": its tree; scans are called SEQ/NAME. Those behind it: theirs, or the plain one
     files: Literal[
-        "plain", "semantickitti", "argoverse2", "kitti-raw", "kitti-tracking", "nuscenes", "pandaset", "vod"
+        "plain",
+        "semantickitti",
+        "argoverse2",
+        "kitti-raw",
+        "kitti-tracking",
+        "nuscenes",
+        "once",
+        "pandaset",
+        "vod",
+        "waymo",
     ] = "plain"
     # "plain": label/NAME.txt; others: `BOX_FILES`
     box_format: Literal["plain", "kitti", "labelcloud", "sustechpoints", "cvat"] = "plain"

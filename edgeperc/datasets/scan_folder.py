@@ -12,7 +12,7 @@
 
 A scan is labeled if it has at least one of the three label files. ``layouts/`` next to this module has descriptions of
 public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
-``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``. With a name of `trees.TREES`, a folder
+``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``. With a name of `TREES`, a folder
 without ``velodyne`` is the root of that set, as it is downloaded.
 """
 

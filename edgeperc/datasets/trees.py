@@ -22,8 +22,10 @@ from .annotations import read_json
 from .kitti import read_numbers
 from .kitti_trees import KittiRaw, KittiTracking, ViewOfDelft
 from .layout import WITH_RIDER, point_names_of
+from .once import Once
 from .pickled import read_pickled
 from .tree import Labeled, Tree, present
+from .waymo import Waymo
 
 _Row = TypeVar("_Row")
 _Json = dict[str, Any]
@@ -388,7 +390,9 @@ TREES: Mapping[str, Callable[[Path], Tree]] = {
     "kitti-raw": KittiRaw,
     "kitti-tracking": KittiTracking,
     "nuscenes": NuScenes,
+    "once": Once,
     "pandaset": PandaSet,
     "vod": ViewOfDelft,
+    "waymo": Waymo,
 }
 """What reads a set in its own tree, by ``files`` of its description."""

@@ -14,7 +14,7 @@ _KNOWN: dict[bytes | tuple[bytes, ...], str] = {
     b"version https://git-lfs": "a pointer of Git LFS; the file itself is not there yet. Run: git lfs pull",
     b"LASF": "a LAS or LAZ file; convert it, e.g.: pdal translate FILE scan.pcd, or read it with laspy",
     b"ARROW1": f"a Feather (Arrow) table; of Argoverse 2, {_OF_SET}; of others, {_TABLE}",
-    b"PAR1": f"a Parquet table; {_TABLE}",
+    b"PAR1": f"a Parquet table; of Waymo, edgeperc eval ROOT:waymo reads it, and {_OF_SET}; of others, {_TABLE}",
     b"ASTM-E57": "an E57 file; convert it with CloudCompare or pdal, to .pcd or .ply",
     b"\x89HDF": "an HDF5 file; read it with h5py, and pass x, y, z and intensity as an array of shape (n, 4)",
     b"MATLAB": "a MATLAB file; save the points as .npy or .pcd",

@@ -121,6 +121,7 @@ def test_the_root_of_a_data_set_is_read(below: str, tmp_path: Path, shell: Shell
         ("a.TXT", b"1 2 3\n", "/*.TXT"),
         ("1.feather", b"ARROW1\0\0", "1.feather is a Feather (Arrow) table"),
         ("00.pkl.gz", b"\x1f\x8b\x08\x00", "edgeperc eval ROOT:pandaset reads it"),
+        ("1.parquet", b"PAR1\0\0\0\0", "edgeperc eval ROOT:waymo reads it"),
         ("a.las", b"LASF", "pdal translate"),
     ],
 )
@@ -141,9 +142,12 @@ def test_a_folder_without_scans_says_what_is_in_it(
 
 
 @pytest.mark.filterwarnings("default")
-def test_the_direction_of_nuscenes_is_asked_for(tmp_path: Path, shell: Shell) -> None:
+def test_the_direction_of_sets_whose_x_is_not_ahead_is_asked_for(tmp_path: Path, shell: Shell) -> None:
     scan = write_scan(tmp_path / "0.pcd.bin")
     assert "pass --turn -90" in shell.err("run", scan, "--sensor", "nuscenes", "--anyway", code=0)
+    assert "to the left, and x is taken for ahead; pass --turn 90" in shell.err(
+        "run", scan, "--sensor", "once", "--anyway", code=0
+    )
     for turn in ("-90", "0", "street"):
         assert "--turn -90" not in shell.err("run", scan, "--sensor", "nuscenes", f"--turn={turn}", "--anyway", code=0)
 

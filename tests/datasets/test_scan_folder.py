@@ -585,7 +585,8 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 def test_descriptions_of_public_sets() -> None:
     kitti = ("kitti-raw", "kitti-tracking")
-    assert known_layouts() == ("av2", "ddad", *kitti, "lyft", "nuscenes", "pandaset", "semantickitti", "vod")
+    others = ("lyft", "nuscenes", "once", "pandaset", "semantickitti", "vod", "waymo")
+    assert known_layouts() == ("av2", "ddad", *kitti, *others)
     for name in known_layouts():
         layout = read_layout(name)
         assert layout.name == name

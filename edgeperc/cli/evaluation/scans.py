@@ -52,8 +52,8 @@ def add_parser(commands: Commands) -> None:
         "datasets DATASET...",
         "the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
         "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
-        "public set (nuscenes, av2, pandaset, vod, ddad, lyft, semantickitti); or labeled images: a folder with "
-        "classes.json, train, trainannot, val, valannot as in CamVid",
+        "public set (nuscenes, av2, pandaset, waymo, once, vod, ddad, lyft, semantickitti); or labeled images: a "
+        "folder with classes.json, train, trainannot, val, valannot as in CamVid",
     )
     reading(
         "--split",
