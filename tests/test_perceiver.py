@@ -762,6 +762,20 @@ def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) ->
     assert finds.sensor.name == other
 
 
+def test_a_sensor_beside_the_origin_of_its_points_is_found_and_matched_from_its_place() -> None:
+    scan, place = urban(8, "vlp-16").points, (6.0, -2.0)
+    answers = [
+        Perceiver("pointseg", sensor="auto", mounting=replace(MODEL_MOUNTING, origin_m=origin_m), on_mismatch="ignore")(
+            points
+        )
+        for points, origin_m in ((scan, (0.0, 0.0)), (scan + np.float32([*place, 0.0, 0.0]), place))
+    ]
+    here, there = answers
+    assert there.sensor == here.sensor == replace(get_sensor("vlp-16"), remission_range=(0.0, 1.0))
+    assert here.remission is not None
+    assert there.remission.coefficients == pytest.approx(here.remission.coefficients, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("model", "sensor", "precision", "loaded"),
     [

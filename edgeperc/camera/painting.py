@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CalibrationError, ImageError, OptionError
 from ..ground.planes import fit_ground, heights_above
-from ..preprocess.returns import returns
+from ..preprocess.returns import about_sensor, returns
 from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
@@ -293,8 +293,8 @@ def _nearest(
     nearest = np.empty((-(-calibration.height // cell_h), -(-calibration.width // cell_w)), np.float32)
     buffer = DepthBuffer(nearest, cell_h, cell_w)
     windows = Windows(between, f_y * half_up, f_y * half_down, f_x * half_side)
-    about_sensor = read_only(points - np.array([*origin_m, 0.0, 0.0], np.float32))  # where beams have elevations
-    fill_nearest(about_sensor, Pixels(*calibration.project(points)), windows, buffer)
+    seen = read_only(about_sensor(points, origin_m))  # beams have elevations there
+    fill_nearest(seen, Pixels(*calibration.project(points)), windows, buffer)
     return buffer
 
 
