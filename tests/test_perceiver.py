@@ -28,6 +28,7 @@ from edgeperc import (
     FitnessError,
     InferenceError,
     ModelFileError,
+    Mounting,
     OptionError,
     Perceiver,
     Perception,
@@ -717,6 +718,20 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
     (box,) = perceive.pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
     np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
     np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
+
+
+def test_a_scan_that_looks_back_with_points_far_away_has_the_same_answer(scan: SimulatedScan) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "full_turn": True}
+    back = Mounting(MODEL_MOUNTING.height_m, 0.0, -(MODEL_MOUNTING.pitch_deg or 0.0), 180.0)
+    far = np.float32([[2e3, 90.0, 5.0, 0.3], [0.0, 1e30, 0.0, 0.2], [-60.0, 3.0, -20.0, 0.1]])
+    here = Perceiver(mounting=MODEL_MOUNTING, **options)(scan.points)
+    there = Perceiver(mounting=back, **options)(np.vstack([scan.points * np.float32([-1, -1, 1, 1]), far]))
+    n = len(scan.points)
+    np.testing.assert_array_equal(there.require_points().labels[:n], here.require_points().labels)
+    np.testing.assert_array_equal(there.require_top_view().drivable, here.require_top_view().drivable)
+    assert [box.label for box in there.boxes] == [box.label for box in here.boxes]
+    places = np.array([box.center for box in here.boxes]) * [-1, -1, 1]
+    np.testing.assert_allclose([box.center for box in there.boxes], places, atol=1e-3)
 
 
 def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
