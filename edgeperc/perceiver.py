@@ -32,7 +32,7 @@ from .preprocess.fitness import FitnessProfile
 from .preprocess.health import Normal, check_health, findings_of, sample_step, without_drops
 from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
-from .preprocess.returns import about_too_near, own_returns, returns
+from .preprocess.returns import about_sensor, about_too_near, own_returns, returns
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
@@ -484,7 +484,7 @@ class Perceiver:
 
     def _find_sensor(self, scan: Points) -> None:
         """Use the sensor whose beams the scan has; SensorError if it does not tell."""
-        found = estimate_sensor([scan])
+        found = estimate_sensor([about_sensor(scan, self._estimator.known.origin_m)])
         found.tell_doubt(self.on_mismatch)
         self._use(found.profile)
         self._sensor_estimate = found
@@ -611,8 +611,9 @@ class Perceiver:
         turned: tuple[findings.Finding, ...] = ()
         matched: tuple[findings.Finding, ...] = ()
         scan, dropped = returns(given, profile, before.known.origin_m)
+        centered = about_sensor(scan, before.known.origin_m)
         if self._renders:
-            self._remission, profile, matched = matcher.add(scan)
+            self._remission, profile, matched = matcher.add(centered)
         scan, n_overflowed = scale(scan, profile, rendered=self._renders)
         if earlier is not None:
             earlier, _ = scale(returns(earlier, profile, before.known.origin_m)[0], profile, rendered=self._renders)
@@ -620,11 +621,11 @@ class Perceiver:
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         roll_deg = before.known.roll_deg
         if check and roll_deg is not None:
-            turned = findings.check_hanging(scan, near_support, share_below, before.known)
+            turned = findings.check_hanging(centered, near_support, share_below, before.known)
         if not before.is_complete and len(scan):
             if check and roll_deg is None:
-                turned = findings.check_beams(scan, profile) or findings.check_ground(
-                    scan, near_support, share_below, profile
+                turned = findings.check_beams(centered, profile) or findings.check_ground(
+                    centered, near_support, share_below, profile
                 )
             try:
                 self._set_mounting(before.add(scan))

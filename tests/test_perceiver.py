@@ -28,6 +28,7 @@ from edgeperc import (
     FitnessError,
     InferenceError,
     ModelFileError,
+    Mounting,
     OptionError,
     Perceiver,
     Perception,
@@ -719,6 +720,20 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_if_it_is_seen_at_all(
     np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
 
 
+def test_a_scan_that_looks_back_with_points_far_away_has_the_same_answer(scan: SimulatedScan) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "full_turn": True}
+    back = Mounting(MODEL_MOUNTING.height_m, 0.0, -(MODEL_MOUNTING.pitch_deg or 0.0), 180.0)
+    far = np.float32([[2e3, 90.0, 5.0, 0.3], [0.0, 1e30, 0.0, 0.2], [-60.0, 3.0, -20.0, 0.1]])
+    here = Perceiver(mounting=MODEL_MOUNTING, **options)(scan.points)
+    there = Perceiver(mounting=back, **options)(np.vstack([scan.points * np.float32([-1, -1, 1, 1]), far]))
+    n = len(scan.points)
+    np.testing.assert_array_equal(there.require_points().labels[:n], here.require_points().labels)
+    np.testing.assert_array_equal(there.require_top_view().drivable, here.require_top_view().drivable)
+    assert [box.label for box in there.boxes] == [box.label for box in here.boxes]
+    places = np.array([box.center for box in here.boxes]) * [-1, -1, 1]
+    np.testing.assert_allclose([box.center for box in there.boxes], places, atol=1e-3)
+
+
 def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     options: dict[str, Any] = {"mounting": MODEL_MOUNTING, "provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
     ahead, around = (Perceiver("pointseg", full_turn=full_turn, **options) for full_turn in (False, True))
@@ -760,6 +775,20 @@ def test_a_sensor_that_is_found_gives_the_answers_of_the_named_one(name: str) ->
     other = "os1-64" if name == "vlp-16" else "vlp-16"
     finds(urban(8, other).points)
     assert finds.sensor.name == other
+
+
+def test_a_sensor_beside_the_origin_of_its_points_is_found_and_matched_from_its_place() -> None:
+    scan, place = urban(8, "vlp-16").points, (6.0, -2.0)
+    answers = [
+        Perceiver("pointseg", sensor="auto", mounting=replace(MODEL_MOUNTING, origin_m=origin_m), on_mismatch="ignore")(
+            points
+        )
+        for points, origin_m in ((scan, (0.0, 0.0)), (scan + np.float32([*place, 0.0, 0.0]), place))
+    ]
+    here, there = answers
+    assert there.sensor == here.sensor == replace(get_sensor("vlp-16"), remission_range=(0.0, 1.0))
+    assert here.remission is not None
+    assert there.remission.coefficients == pytest.approx(here.remission.coefficients, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CalibrationError, ImageError, OptionError
 from ..ground.planes import fit_ground, heights_above
-from ..preprocess.returns import returns
+from ..preprocess.returns import about_sensor, returns
 from ..system.fields import OPTIONS
 from ..system.kernels import njit
 from ..types.frame import ModelFrame
@@ -233,7 +233,8 @@ def _hidden_by(
         is_ground = heights_above(surface, above).mask
         cells = np.column_stack([places, np.zeros(len(places))])
         cells[:, 2] -= heights_above(surface, cells.astype(np.float32)).height_m if surface.plane else np.nan
-    return rows, _nearest(read_only(rows[~is_ground]), calibration, profile), (cells - frame.t) @ frame.R
+        buffer = _nearest(rows[~is_ground], calibration, profile, known.origin_m)
+    return rows, buffer, (cells - frame.t) @ frame.R
 
 
 def _check_upright(R: Floats, up: Floats) -> None:
@@ -276,7 +277,9 @@ def _road_of(image: Perception | ImageLabels | Mask, calibration: Calibration) -
     return np.where(labels == UNSEEN, np.uint8(UNSEEN), found.drivable.astype(np.uint8))
 
 
-def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) -> DepthBuffer:
+def _nearest(
+    points: Points, calibration: Calibration, sensor: SensorProfile, origin_m: tuple[float, float]
+) -> DepthBuffer:
     elevations = np.radians(sensor.elevations_deg)
     step = 2.0 * math.pi / sensor.columns
     gaps = -np.diff(elevations) if len(elevations) > 1 else np.array([step])
@@ -290,7 +293,8 @@ def _nearest(points: Points, calibration: Calibration, sensor: SensorProfile) ->
     nearest = np.empty((-(-calibration.height // cell_h), -(-calibration.width // cell_w)), np.float32)
     buffer = DepthBuffer(nearest, cell_h, cell_w)
     windows = Windows(between, f_y * half_up, f_y * half_down, f_x * half_side)
-    fill_nearest(points, Pixels(*calibration.project(points)), windows, buffer)
+    seen = read_only(about_sensor(points, origin_m))  # beams have elevations there
+    fill_nearest(seen, Pixels(*calibration.project(points)), windows, buffer)
     return buffer
 
 

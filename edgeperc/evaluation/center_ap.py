@@ -13,7 +13,7 @@ import numpy as np
 
 from ..types.perception import Box
 from ..types.points import Floats
-from .metrics import Listed, object_key
+from .metrics import Listed, ends_of_equal, object_key
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 ERROR_DISTANCE_M = 2.0
@@ -38,7 +38,9 @@ def count_centers(boxes: Sequence[Box], to_find: Sequence[Box], ignored: Sequenc
         rights = [box for box in to_find if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
         spares = [box for box in ignored if box.label in (label, "ignore")]
         guesses = [box for box in boxes if box.label == label and math.hypot(*box.center[:2]) <= farthest_m]
-        guesses.sort(key=lambda box: -box.score)
+        nearest_m = _distances(guesses, rights).min(axis=1, initial=math.inf)
+        order = np.lexsort((nearest_m, [-box.score for box in guesses]))
+        guesses = [guesses[k] for k in order.tolist()]
         away_m, spare_m = _distances(guesses, rights), _distances(guesses, spares)
         table[label] = tuple(object_key(drive, box) for box in rights)
         for least_m in DISTANCES_M:
@@ -78,21 +80,23 @@ def _matched(
 def _curve(guesses: Sequence[Guess], n_truth: int) -> tuple[Floats, Floats]:
     """Precision at `LEVELS` of recall (101,), and mean errors (3,)."""
     rows = np.array(guesses, np.float64).reshape(-1, 5)
-    rows = rows[np.argsort(-rows[:, 0], kind="stable")]
+    rows = rows[np.argsort(-rows[:, 0])]
     is_hit = rows[:, 1] > 0.0
     if n_truth == 0 or not is_hit.any():
         return np.zeros(len(LEVELS)), np.ones(3)
-    n_hits = np.cumsum(is_hit)
-    recall, precision = n_hits / n_truth, n_hits / np.arange(1, len(rows) + 1)
+    ends, hits = ends_of_equal(rows[:, 0]), rows[is_hit]
+    n_hits = np.cumsum(is_hit)[ends]
+    recall, precision = n_hits / n_truth, n_hits / (ends + 1)
     at_levels = np.interp(LEVELS, recall, precision, right=0.0)
-    score_at = np.interp(LEVELS, recall, rows[:, 0], right=0.0)
-    hits = rows[is_hit]
+    score_at = np.interp(LEVELS, recall, rows[ends, 0], right=0.0)
     # Mean error of the hits with at least the score at each level of recall.
-    means = np.cumsum(hits[:, 2:], axis=0) / np.arange(1, len(hits) + 1)[:, None]
+    last_hits = ends_of_equal(hits[:, 0])
+    means = (np.cumsum(hits[:, 2:], axis=0) / np.arange(1, len(hits) + 1)[:, None])[last_hits]
     last = int(np.flatnonzero(score_at)[-1]) if score_at.any() else 0
     if last < FIRST:
         return at_levels, np.ones(3)
-    errors = [np.interp(score_at[::-1], hits[::-1, 0], column[::-1])[::-1] for column in means.T]
+    scores = hits[last_hits, 0]
+    errors = [np.interp(score_at[::-1], scores[::-1], column[::-1])[::-1] for column in means.T]
     return at_levels, np.array([error[FIRST : last + 1].mean() for error in errors])
 
 

@@ -215,8 +215,7 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     last = np.searchsorted(-steps[:, 0], -thresholds, side="right") - 1
     curve[: len(last)] = n_hits[last] / np.maximum(n_hits[last] + n_false[last], 1)
     curve = np.maximum.accumulate(curve[::-1])[::-1]
-    # Scans of equal scores change together.
-    ends = np.flatnonzero(np.append(np.diff(steps[:, 0]) != 0.0, True)[: len(steps)])
+    ends = metrics.ends_of_equal(steps[:, 0])
     levels = np.arange(1, metrics.N_POSITIONS + 1)
     ap = metrics.interpolated_precision(n_hits[ends], (n_hits + n_false)[ends], n_truth, levels, metrics.N_POSITIONS)
     return float(curve[1:].mean()), float(curve[::4].mean()), ap

@@ -97,13 +97,20 @@ class Confusion:
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
     """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4), NaN
-    without objects to find; equal scores keep their order.
+    without objects to find. Equal scores count together: which comes first is a matter of chance.
     """
     values, right = np.asarray(scores, dtype=np.float64), np.asarray(hits, dtype=np.bool_)
     if n_truth == 0:
         return float("nan")
-    n_right = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
-    return interpolated_precision(n_right, np.arange(1, len(n_right) + 1), n_truth, np.arange(11), 10)
+    order = np.argsort(-values)
+    ends = ends_of_equal(values[order])
+    n_right = np.cumsum(right[order], dtype=np.int64)[ends]
+    return interpolated_precision(n_right, ends + 1, n_truth, np.arange(11), 10)
+
+
+def ends_of_equal(falling: Floats) -> Ints64:
+    """The last row of each run of equal scores, which fall."""
+    return np.flatnonzero(np.append(np.diff(falling) != 0.0, True)[: len(falling)])
 
 
 def interpolated_precision(found: Ints64, predicted: Ints64, n_truth: int, levels: Ints64, n_levels: int) -> float:
@@ -207,9 +214,10 @@ class BoxEvaluator:
         self, predicted: Iterable[Box], truth: Iterable[Box], *, ignored: Iterable[Box] = (), drive: str = ""
     ) -> list[tuple[Box | None, Box | None]]:
         """Count the boxes of a scan, but those that match ``ignored``, and pair them of any class, or with None."""
-        guesses = sorted(predicted, key=lambda box: -box.score)
-        rights, spares = list(truth), list(ignored)
-        overlap = oriented_iou(self._rectangles(guesses), self._rectangles(rights))
+        rights, spares, every = list(truth), list(ignored), list(predicted)
+        overlap = oriented_iou(self._rectangles(every), self._rectangles(rights))
+        order = np.lexsort((-overlap.max(axis=1, initial=0.0), [-box.score for box in every]))
+        guesses, overlap = [every[k] for k in order.tolist()], overlap[order]
         spared = oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold
         excused = np.asarray(spared.any(axis=1))
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):

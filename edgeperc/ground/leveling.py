@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import MountingError
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from ..types.points import Floats, Ints, Points, read_only
+from ..types.points import Floats, Ints, Mask, Points, read_only
 from .planes import CELL_M, N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 
 __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
@@ -187,20 +187,27 @@ class MountingEstimator:
         known = self.known
         if known.is_known:
             return MountingEstimate(known, 0.0, 0.0, 0.0, 0.0, 0)
+        middle, sd = self._of_scans()
+        of_scan = np.sqrt(sd**2 @ _to_vehicle(middle.yaw_deg) ** 2)
+        height, roll, pitch, yaw = np.where(np.isnan(_values(known)), of_scan, 0.0).tolist()
+        return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))
+
+    def _of_scans(self) -> tuple[Mounting, Floats]:
+        """The medians over the scans of what is not known, and standard deviations (4,), those of the tilt about the
+        vehicle's axes.
+        """
         if not self._found:
             raise MountingError("no scan shows the ground around the vehicle")
         scans = np.array(self._found)
         support = scans[:, 4].max()
         scans = scans[scans[:, 4] >= 0.5 * support]
         found, uncertainty = scans[:, :4], np.median(scans[:, 5:], axis=0)
-        spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
+        middle = _filled(self.known, np.median(found, axis=0))
+        turned = found @ _to_vehicle(middle.yaw_deg).T
+        spread = turned.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
         of_one = [np.interp(support, _SUPPORT, sd) for sd in (_HEIGHT_SD_M, _ROLL_SD_DEG, _PITCH_SD_DEG)]
-        middle = _filled(known, np.median(found, axis=0))
-        of_height, of_roll, of_pitch = np.hypot(of_one, uncertainty).tolist()
-        of_plane = [of_height, *_turned_limits(of_roll, of_pitch, middle.yaw_deg)]
-        sd = np.hypot([*of_plane, _STREET_YAW_SD], spread / math.sqrt(len(found)))
-        height, roll, pitch, yaw = np.where(np.isnan(_values(known)), sd, 0.0).tolist()
-        return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))
+        of_plane = np.hypot(of_one, uncertainty)
+        return middle, np.hypot([*of_plane, _STREET_YAW_SD], spread / math.sqrt(len(found)))
 
     def mounting(self) -> Mounting:
         """The mounting to use: the estimate, or the training vehicle's where that differs by no more than streets do.
@@ -213,21 +220,29 @@ class MountingEstimator:
         found = self.estimate().mounting
         usual = _usual(self.known, found.yaw_deg)
         off, same, sure = self._compared()
-        if (off <= np.maximum(same, sure)).all():
+        if (np.abs(off) <= np.maximum(same, sure)).all():
             return usual
-        return replace(found, **{name: getattr(usual, name) for name in self.doubtful()})
+        if not (doubted := self._doubted()).any():
+            return found
+        off[1:3][doubted] = 0.0
+        roll_deg, pitch_deg = (_values(usual) + off @ _to_vehicle(found.yaw_deg))[1:3].tolist()
+        return _filled(self.known, _values(replace(found, roll_deg=roll_deg, pitch_deg=pitch_deg)))
 
     def doubtful(self) -> tuple[str, ...]:
         """Which of ``roll_deg`` and ``pitch_deg`` the scans suggest, but do not show surely: they are not used."""
         if self.known.is_known or not self._found:
             return ()
+        turn = np.abs(_to_vehicle(self.estimate().mounting.yaw_deg)[1:3, 1:3])
+        is_part = (self._doubted() @ turn > 1e-9) & np.isnan(_values(self.known)[1:3])
+        return tuple(name for name, is_so in zip(("roll_deg", "pitch_deg"), is_part.tolist(), strict=True) if is_so)
+
+    def _doubted(self) -> Mask:
+        """Of roll and pitch about the vehicle's axes, (2,), which the scans suggest, but do not show surely."""
         off, same, sure = self._compared()
-        doubtful = ((off > same) & (off <= sure))[1:3]
+        doubtful = ((np.abs(off) > same) & (np.abs(off) <= sure))[1:3]
         _, roll_deg, pitch_deg = np.median(np.array(self._found)[:, 5:], axis=0)
         is_uneven = roll_deg > EVEN_ROLL_DEG or pitch_deg > EVEN_PITCH_DEG
-        if not is_uneven or not (doubtful & (off[1:3] > DOUBTED_DEG)).any():
-            return ()
-        return tuple(name for name, is_so in zip(("roll_deg", "pitch_deg"), doubtful.tolist(), strict=True) if is_so)
+        return doubtful & (is_uneven and (doubtful & (np.abs(off[1:3]) > DOUBTED_DEG)).any())
 
     def is_height_unsure(self) -> bool:
         """Whether the scans suggest another height than the usual one, and show little ground, or only far away."""
@@ -239,15 +254,12 @@ class MountingEstimator:
 
     def _compared(self) -> tuple[Floats, Floats, Floats]:
         """How far height, roll, pitch and yaw are from the usual ones, and by how much they may be: as streets differ,
-        and twice the standard deviation.
+        and twice the standard deviation. The tilt is about the vehicle's axes.
         """
-        found = self.estimate()
-        yaw_deg = found.mounting.yaw_deg
-        off = np.abs(_values(found.mounting) - _values(_usual(self.known, yaw_deg)))
-        sure = 2.0 * np.array(
-            [min(found.height_sd_m, 0.5 * OTHER_HEIGHT_M), found.roll_sd_deg, found.pitch_sd_deg, 0.0]
-        )
-        return off, np.array([SAME_HEIGHT_M, *_turned_limits(SAME_ROLL_DEG, SAME_PITCH_DEG, yaw_deg), 0.0]), sure
+        found, sd = self._of_scans()
+        off = _to_vehicle(found.yaw_deg) @ (_values(found) - _values(_usual(self.known, found.yaw_deg)))
+        sure = 2.0 * np.array([min(sd[0], 0.5 * OTHER_HEIGHT_M), *sd[1:3], 0.0])
+        return off, np.array([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0]), sure
 
 
 def _values(mounting: Mounting) -> Floats:
@@ -272,13 +284,14 @@ def _usual(known: Mounting, yaw_deg: float | None) -> Mounting:
     return _filled(known, np.array([height_m, math.sin(yaw) * pitch_deg + 0.0, math.cos(yaw) * pitch_deg, 0.0]))
 
 
-def _turned_limits(roll_deg: float, pitch_deg: float, yaw_deg: float | None) -> tuple[float, float]:
-    """By how much roll and pitch of a scan turned by a yaw differ if those about the vehicle's axes do by so much, in
-    one of the two alone unless the yaw is a multiple of 90 degrees.
+def _to_vehicle(yaw_deg: float | None) -> Floats:
+    """What turns small differences of height, roll, pitch and yaw (4,) of a scan with this yaw to those of the tilt
+    about the vehicle's axes.
     """
-    yaw = math.radians(yaw_deg or 0.0)
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return math.hypot(cos * roll_deg, sin * pitch_deg), math.hypot(sin * roll_deg, cos * pitch_deg)
+    cos, sin = math.cos(math.radians(yaw_deg or 0.0)), math.sin(math.radians(yaw_deg or 0.0))
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[cos, -sin], [sin, cos]]
+    return turn
 
 
 def _leveled(scan: Points, guess: Mounting, height_m: float | None) -> tuple[Mounting, float, Floats]:

@@ -437,7 +437,7 @@ def mark_isolated(
                 px = np.float64(points[row, 0]) - np.float64(points[i, 0])
                 py = np.float64(points[row, 1]) - np.float64(points[i, 1])
                 pz = np.float64(points[row, 2]) - np.float64(points[i, 2])
-                beside += px * px + py * py + pz * pz <= around * around
+                beside += 0.0 < px * px + py * py + pz * pz <= around * around
         if beside <= most and is_isolated(points, eye, k, most, (around, radius[2]), heads, buffers):
             counts[side, 1] += 1
             counts[side, 2] += is_dim
@@ -455,7 +455,8 @@ def bucket(a: int, b: int, c: int, last: int) -> int:
 def is_isolated(
     points: Points, eye: Floats, k: int, most: int, radius: tuple[float, float], heads: Ints, buffers: Ints
 ) -> bool:
-    """Whether at most ``most`` of the other near points are around the k-th; its own cell is looked at first.
+    """Whether at most ``most`` of the other near points are around the k-th; its own cell is looked at first. What is
+    in its very place is the same return: drivers write the two returns of a pulse even if they are one.
 
     radius : around it, and the edge of a cell [m].
     """
@@ -471,7 +472,7 @@ def is_isolated(
         while j >= 0:
             row = rows[j]
             px, py, pz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-            is_near = j != k and px * px + py * py + pz * pz <= radius[0] * radius[0]
+            is_near = 0.0 < px * px + py * py + pz * pz <= radius[0] * radius[0]
             if (
                 is_near  # and of this cell, as another one may have the same list
                 and int((points[row, 0] - eye[0] + 16.0) * per_m) == u

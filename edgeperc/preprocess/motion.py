@@ -16,7 +16,7 @@ from ..errors import EdgepercError, OptionError, PointsError, SensorError, Stamp
 from ..system.clock import as_seconds
 from ..system.fields import OPTIONS, SCANS, Fields
 from ..system.kernels import njit
-from ..types.frame import fill_moved, pose_between, poses_of, quaternion
+from ..types.frame import fill_moved, poses_of
 from ..types.mounting import UNKNOWN_MOUNTING, Mounting
 from ..types.points import MAX_ROUNDING_M, Floats, Floats32, Points, as_points, read_only
 from ..types.rigid import numbers_of, rigid, times_of
@@ -111,6 +111,19 @@ class Motion:
         way = (np.eye(3) - 0.5 * cross + share * cross @ cross) @ first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
         (x, y, z), (roll, pitch, yaw) = (way / duration).tolist(), (turn / duration).tolist()
         return cls((x, y, z), (roll, pitch, yaw))
+
+    def _after(self, seconds: float) -> Floats:
+        """The pose (4, 4) that it leads to, seen from the first one."""
+        turn = np.array(self.rate_radps) * seconds
+        cross, angle = np.cross(np.eye(3), turn), float(np.linalg.norm(turn))
+        a, b, c = 1.0, 0.5, 1.0 / 6.0
+        if angle > 1e-4:
+            a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+            c = (1.0 - a) / angle**2
+        pose = np.eye(4)
+        pose[:3, :3] += a * cross + b * cross @ cross
+        pose[:3, 3] = (np.eye(3) + b * cross + c * cross @ cross) @ self.velocity_mps * seconds
+        return pose
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -251,23 +264,27 @@ class Trajectory:
         StampError
             The times are not finite, or more than 0.2 s outside those of the poses; or the poses around them are more
             than 2 s and 1 m apart.
+        TrackingError
+            As `pose`.
         """
         before, after = self._around(first_s, last_s)
         poses, times_s = self.T_world_sensor, self.times_s
         return Motion._of(poses[before], poses[after], float(times_s[after] - times_s[before]))
 
     def pose(self, at_s: float) -> Floats:
-        """T_world_sensor (4, 4) at a time [s], between the poses around it, such as for a `Tracker` or a `RollingGrid`.
+        """T_world_sensor (4, 4) at a time [s], such as for a `Tracker` or a `RollingGrid`: by the `motion` between the
+        poses around it.
 
         Raises
         ------
         StampError
             As `motion`, of a scan at this time.
+        TrackingError
+            Between the poses around it is about half a turn or more.
         """
-        around = [*self._around(at_s, at_s)]
-        begin_s, end_s = self.times_s[around].tolist()
-        first, second = ((T[:3, 3], np.array(quaternion(T[:3, :3]))) for T in self.T_world_sensor[around])
-        return pose_between(first, second, (as_seconds(at_s) - begin_s) / (end_s - begin_s))
+        before, _ = self._around(at_s, at_s)
+        motion = self.motion(at_s, at_s)
+        return np.asarray(self.T_world_sensor[before] @ motion._after(as_seconds(at_s) - self.times_s[before]))
 
     def _around(self, first_s: float, last_s: float) -> tuple[int, int]:
         """The last pose before a scan and the first one after it; errors as `motion`."""

@@ -49,6 +49,11 @@ def own_returns(points: Points, sensor: SensorProfile, origin_m: tuple[float, fl
     return points[((lows <= about) & (about <= highs)).all(axis=1)]
 
 
+def about_sensor(points: Points, origin_m: tuple[float, float]) -> Points:
+    """The points (n, 4) about a sensor at this x, y of their frame [m]; the same array if that is the origin."""
+    return points if origin_m == (0.0, 0.0) else read_only(points - np.array([*origin_m, 0.0, 0.0], np.float32))
+
+
 def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile) -> str:
     """A sentence about the rows that are too near: how many, what they are, what was done, how to change it."""
     return (

@@ -24,6 +24,9 @@ N_SHARES = 20
 MIN_POINTS = 200  # points in a stratum
 FOLDS = 10
 CELL_M = 0.8  # cubes in which surfaces are fitted
+# Remissions of a narrower range are taken in parts of it: of 0..1, ln(1 + x) would be nearly a line. With scans of DDAD
+# and Argoverse 2, which have 0..1, functions are off by 0.026 and 0.040 in place of 0.052 and 0.050.
+LEAST_SCALE = 255.0
 
 # fmt: off
 REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingProxyType(
@@ -95,7 +98,8 @@ def fit_functions(
     raw, wanted : of the sensor to adapt, from 0 on with a range of ``full_scale``, and of the other at the same places,
         0..1.
     """
-    x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
+    finer = max(LEAST_SCALE / full_scale, 1.0)
+    x, y = finer * np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
         raise SensorError(f"got {len(x)} raw values and {len(y)} wanted ones; expected as many of each")
     good = np.isfinite(x) & np.isfinite(y)
@@ -113,7 +117,7 @@ def fit_functions(
             errors[held] = _values(kind, x[held], _fitted(kind, x[~held], y[~held])) - y[held]
         rmse = math.sqrt(float(np.mean(errors**2)))
         best = tuple(float(c) for c in _fitted(kind, x, y))
-        found.append(RemissionFunction(kind, best, full_scale, to, rmse, source))
+        found.append(RemissionFunction(kind, best, finer * full_scale, to, rmse, source))
     return tuple(sorted(found, key=lambda function: function.rmse))
 
 

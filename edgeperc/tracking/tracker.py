@@ -187,8 +187,9 @@ class Tracker:
             ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
             separated from the sensor's: tracks keep their identity, but speeds over ground are unreliable.
         mounting : Mounting
-            Of the sensor (`Perception.mounting`), else OptionError: without poses, it says which way the vehicle
-            drives, which moves fast ahead, hardly aside and not up or down.
+            Of the sensor (`Perception.mounting`), else OptionError: it says from where in the frame of the boxes the
+            sensor looks and, without poses, which way the vehicle drives, which moves fast ahead, hardly aside and not
+            up or down.
 
         Returns
         -------
@@ -237,7 +238,7 @@ class Tracker:
             self._clock = clock
             return late
         kinds = self.kinds_of(names)
-        classes = self.class_table[kinds]
+        classes, ranges = self.class_table[kinds], np.hypot(*(given[:, :2] - mounting.origin_m).T)
 
         dt = stamp_s - session.stamp_s if session.posed is not None else 0.0
         memory_s = self.class_table["memory_s"][session.tracks["label"]]
@@ -255,24 +256,27 @@ class Tracker:
             stands = ((tracks["hits"] == 1) | slow) & ~np.isin(of["group"], people)
             place = np.where(stands[:, None], predictions.means[:, RANDOM_MOTION], state)
             spread = np.where(stands[:, None, None], predictions.covariances[:, RANDOM_MOTION], covariance)
-            estimate = self._estimated_pose(session, tracks, place, spread, given, classes, _leveled(mounting), dt)
+            of_boxes = given, ranges, classes
+            estimate = self._estimated_pose(session, tracks, place, spread, *of_boxes, _leveled(mounting), dt)
             pose, twist, twist_variances = estimate
-        detections = _detections(given, fronts, kinds, classes["group"].copy(), pose)
-        farther = 1.0 + _away(state, of, pose)  # the standard deviations of detections grow
+        eye = pose.copy()  # the sensor may be beside the origin of its frame
+        eye[:3, 3] += pose[:3, :2] @ mounting.origin_m
+        detections = _detections(given, fronts, kinds, classes["group"].copy(), ranges, pose)
+        farther = 1.0 + _away(state, of, eye)  # the standard deviations of detections grow
         gates = Gates(of["sigmas"] * farther[:, None], of["odds"].copy(), tracks["group"].copy(), of["gate"].copy())
         likelihoods, beta, n_approximated = _associated(predictions, gates, detections)
         _update_motion(tracks, predictions, gates.sigmas, detections.places, likelihoods, beta)
         _update_shapes(tracks, detections, beta, of["shape"] * farther[:, None], dt)
-        _update_evidence(tracks, of, detections, beta, pose, dt)
+        _update_evidence(tracks, of, detections, beta, eye, dt)
         n = len(tracks)
         tracks = self._with_newborn(tracks, detections, classes, beta)
         n_born = len(tracks) - n
         tracks = self._living(tracks)
         strength = strength_of(tracks)
-        tracks["score"] = _scores(tracks, strength, self.class_table[tracks["label"]], pose)
+        tracks["score"] = _scores(tracks, strength, self.class_table[tracks["label"]], eye)
 
         reported = tracks["existence"] > 0.0
-        lives.mark_out_of_view(tracks, pose, self._right, self._width, reported)
+        lives.mark_out_of_view(tracks, eye, self._right, self._width, reported)
         strongest_first = np.argsort(-strength, kind="stable")
         lives.mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
@@ -329,6 +333,7 @@ class Tracker:
         state: Floats,
         covariance: Floats,
         given: Floats,
+        ranges: Floats,
         classes: Records,
         leveled: Floats,
         dt: float,
@@ -348,8 +353,7 @@ class Tracker:
             landmarks = landmarks[np.argsort(landmarks[:, 2], kind="stable")[:MAX_LANDMARKS]]
         detections = np.empty((len(given), 4))
         detections[:, :2], detections[:, 3] = (given[:, :3] @ leveled.T)[:, :2], classes["group"]
-        farther = 1.0 + np.hypot(given[:, 0], given[:, 1]) / classes["range_m"]
-        detections[:, 2] = (classes["sigmas"][:, 0] * farther) ** 2
+        detections[:, 2] = (classes["sigmas"][:, 0] * (1.0 + ranges / classes["range_m"])) ** 2
         if len(detections) > 2 * MAX_LANDMARKS:
             detections = detections[np.argsort(detections[:, 2], kind="stable")[: 2 * MAX_LANDMARKS]]
         kept = np.array([1.0, 1.0, math.exp(-dt / TURN_MEMORY_S)])
@@ -421,20 +425,21 @@ def combine(states: Floats, covariances: Floats, modes: Floats) -> tuple[Floats,
     return state, covariance
 
 
-def _detections(given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, pose: Floats) -> Detections:
+def _detections(
+    given: Floats, fronts: Floats, kinds: Ints64, groups: Ints64, ranges: Floats, pose: Floats
+) -> Detections:
     """The checked boxes (m, 8) in the world frame."""
     places = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     shapes = given[:, 2:6].copy()
     shapes[:, 0] = places[:, 2]
     cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
     places[:, 2] = np.arctan2(pose[1, 0] * cos + pose[1, 1] * sin, pose[0, 0] * cos + pose[0, 1] * sin)
-    ranges = np.hypot(given[:, 0], given[:, 1])
     return Detections(places, shapes, _logit(given[:, 7]), fronts, kinds, groups, ranges, np.arange(len(given)))
 
 
-def _away(state: Floats, classes: Records, pose: Floats) -> Floats:
+def _away(state: Floats, classes: Records, eye: Floats) -> Floats:
     """Distances of tracks from the sensor in units of ``range_m``, (n,)."""
-    return np.asarray(np.hypot(state[:, 0] - pose[0, 3], state[:, 1] - pose[1, 3]) / classes["range_m"])
+    return np.asarray(np.hypot(state[:, 0] - eye[0, 3], state[:, 1] - eye[1, 3]) / classes["range_m"])
 
 
 def _associated(predictions: Predictions, gates: Gates, detections: Detections) -> tuple[Floats, Floats, int]:
@@ -466,7 +471,7 @@ def _update_shapes(tracks: Records, detections: Detections, beta: Floats, sigmas
 
 
 def _update_evidence(
-    tracks: Records, classes: Records, detections: Detections, beta: Floats, pose: Floats, dt: float
+    tracks: Records, classes: Records, detections: Detections, beta: Floats, eye: Floats, dt: float
 ) -> None:
     """Collect what the scan says of fronts, labels and existence."""
     state, fronts = tracks["state"].copy(), tracks["fronts"].copy()
@@ -475,13 +480,13 @@ def _update_evidence(
     lives.update_fronts(state, speed_sigma, moving_mps, beta, detections.places, detections.fronts, fronts)
     tracks["fronts"] = fronts
     hidden = np.zeros(len(tracks))
-    lives.fill_hidden(state, tracks["shape"].copy(), beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
+    lives.fill_hidden(state, tracks["shape"].copy(), beta[:, 0] < 0.5, eye[:2, 3].copy(), hidden)
     lives.update_lives(tracks, classes, beta, hidden, detections.logits, detections.kinds, dt)
 
 
-def _scores(tracks: Records, strength: Floats, classes: Records, pose: Floats) -> Floats:
+def _scores(tracks: Records, strength: Floats, classes: Records, eye: Floats) -> Floats:
     """Log odds (n,) of the reported scores."""
-    away = _away(tracks["state"], classes, pose)
+    away = _away(tracks["state"], classes, eye)
     scores = strength + classes["latest"] * (tracks["last_logit"] - strength)
     return np.asarray(scores + (classes["far_logit"] * away - classes["coasting_logit"] * tracks["misses"]))
 

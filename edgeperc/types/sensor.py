@@ -65,7 +65,7 @@ class RemissionFunction:
     coefficients : tuple of float
         a, b and, for a polynomial, c.
     full_scale : float
-        Width of the sensor's raw remission range when the function was fitted, e.g. 255.
+        x of a remission of 1. In fitted functions it is the width of the sensor's raw remission range, at least 255.
     to : str
         The sensor whose remission is the result.
     rmse : float

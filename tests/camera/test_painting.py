@@ -281,6 +281,19 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
             paint(image.labels, points, Calibration(NEAR.K, wrong, NEAR.width, NEAR.height), mounting=mounting)
 
 
+def test_the_sensor_may_be_beside_the_origin_of_its_points() -> None:
+    """Beams start at the sensor: where they did at the origin, other points were hidden."""
+    scan, image = seen(0, "hdl-64e", NEAR)
+    T_there_here = np.eye(4)
+    T_there_here[:2, 3] = 16.0, -8.0
+    points = scan.points + np.array([16.0, -8.0, 0.0, 0.0], np.float32)
+    there = Calibration(NEAR.K, NEAR.T_camera_sensor @ np.linalg.inv(T_there_here), NEAR.width, NEAR.height)
+    same = paint(image.labels, scan.points, NEAR) == paint(
+        image.labels, points, there, mounting=replace(MODEL_MOUNTING, origin_m=(16.0, -8.0))
+    )
+    assert same.mean() > 0.9999
+
+
 def test_the_road_of_an_image_lies_on_the_roads_of_the_scene() -> None:
     n = counted("hdl-64e", NEAR)
     assert n["cells_right"] / n["cells"] >= 0.96

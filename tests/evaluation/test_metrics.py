@@ -83,10 +83,10 @@ def test_coarser_classes() -> None:
 
 
 def eleven_points(scores: Sequence[float], hits: Sequence[bool], n_truth: int) -> float:
-    """As SSADNet's appendix has it, word for word."""
-    order = np.argsort(-np.array(scores), kind="stable")
-    found = np.cumsum(np.array(hits)[order])
-    precision = found / np.arange(1, len(found) + 1)
+    """As SSADNet's appendix has it, at each threshold of the score."""
+    taken = np.array(scores) >= np.array(scores)[:, None]
+    found = (taken & np.array(hits)).sum(axis=1)
+    precision = found / taken.sum(axis=1)
     return np.mean([max(precision[found * 10 >= step * n_truth], default=0.0) for step in range(11)])
 
 
@@ -115,8 +115,8 @@ def test_average_precision_at_its_ends() -> None:
     assert math.isnan(metrics.average_precision([0.5], [False], 0))
     # A recall of exactly 0.3 counts for the four levels 0 to 0.3, whatever 0.1 * 3 rounds to.
     assert metrics.average_precision([0.9, 0.8, 0.7], [True] * 3, 10) == pytest.approx(4 / 11)
-    # Of equal scores the earlier counts as the better.
-    assert metrics.average_precision([0.5, 0.5], [True, False], 1) == 1.0
+    # Of equal scores none is the better.
+    assert metrics.average_precision([0.5, 0.5], [True, False], 1) == 0.5
     assert metrics.average_precision([0.5, 0.5], [False, True], 1) == 0.5
 
 

@@ -285,7 +285,7 @@ def test_real_scans_give_the_applied_mounting_and_an_honest_uncertainty(kitti_ro
     assert (within.mean(axis=0) >= 0.9).all(), within.mean(axis=0)
 
 
-@pytest.mark.parametrize("yaw_deg", [-90.0, 180.0])
+@pytest.mark.parametrize("yaw_deg", [-90.0, 180.0, 37.0, -45.0])
 def test_a_turned_scan_is_leveled_as_the_same_scan_ahead(scans: list[NDArray[np.float32]], yaw_deg: float) -> None:
     """The tilt of the training vehicle, and what streets differ by, are about the vehicle's axes, not the scan's."""
     for tilt in ((0.0, 0.0), (2.0, -0.8), (0.0, 3.0)):

@@ -63,11 +63,20 @@ def test_ranking_of_functions_matches_the_papers_table() -> None:
 
 
 @settings(max_examples=40)
-@given(st.sampled_from(FUNCTIONS), st.floats(-0.5, 0.5), st.floats(0.01, 2.0), st.integers(0, 2**32 - 1))
-def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
+@given(
+    st.sampled_from(FUNCTIONS),
+    st.floats(-0.5, 0.5),
+    st.floats(0.01, 2.0),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([255.0, 100.0, 1.0]),
+)
+def test_exact_pairs_recover_the_function_in_any_unit(
+    shape: RemissionFunction, offset: float, size: float, seed: int, unit: float
+) -> None:
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
     wanted = offset + size * _value(shape, x)
-    best = sensor_fit.fit_functions(x, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
+    best = sensor_fit.fit_functions(unit / 255.0 * x, wanted, full_scale=unit, to="hdl-64e", source="")[0]
+    assert best.full_scale == pytest.approx(255.0)
     assert best.rmse < 1e-9 * (1.0 + np.abs(wanted).max())
     np.testing.assert_allclose(_value(best, x), wanted, atol=1e-7)
 

@@ -235,6 +235,15 @@ def test_weather_is_found_in_its_first_scan(kind: str, seed: int) -> None:
     assert ("spray, dust or exhaust" if health.has_cloud else "rain, snow, or dust all round") in text
 
 
+def test_drops_are_found_where_both_returns_of_a_pulse_are_written() -> None:
+    """A drop whose two returns are one seemed to have a neighbor: rain was clear air, and each drop an object."""
+    scan = clear(9)
+    wet = np.repeat(WEATHER["rain"](scan), 2, axis=0)
+    assert check_health(wet, HDL, Normal())[0].has_drops
+    assert check_health(np.repeat(scan, 2, axis=0), HDL, Normal())[0].findings == ()
+    assert without_drops(wet, HDL)[1] > 1.7 * without_drops(wet[::2], HDL)[1]
+
+
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_fog_is_a_range_that_shrank_and_a_narrow_street_is_not(seed: int) -> None:
     normal = usual()

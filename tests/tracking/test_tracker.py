@@ -129,6 +129,41 @@ def test_without_poses_the_sensors_motion_is_found(tilt_and_turn: tuple[float, f
         assert np.hypot(*track.velocity) < 1.0
 
 
+def test_a_sensor_beside_the_origin_of_its_frame_has_the_same_tracks() -> None:
+    """What is far, hidden or out of view is so from the sensor: seen from the origin, other tracks were reported."""
+    there = edgeperc.Mounting(1.73, 0.0, 0.0, 0.0, (12.0, -5.0))
+    T_there_here = np.eye(4)
+    T_there_here[:2, 3] = there.origin_m
+    here, aside = Tracker(field_of_view_deg=(40.0, -40.0)), Tracker(field_of_view_deg=(40.0, -40.0))
+    for k, (boxes, pose) in enumerate(drive(60)):
+        seen = [box for j, box in enumerate(boxes) if (j + k) % 4]
+        moved = [replace(box, center=(box.center[0] + 12.0, box.center[1] - 5.0, box.center[2])) for box in seen]
+        wanted = here.update(seen, 0.1 * k, pose)
+        tracks = aside.update(moved, 0.1 * k, pose @ np.linalg.inv(T_there_here), mounting=there)
+        assert tracks.ids.tolist() == wanted.ids.tolist()
+        np.testing.assert_allclose(tracks.scores, wanted.scores, atol=1e-6)
+        np.testing.assert_allclose(tracks.boxes[:, :3] - [12.0, -5.0, 0.0], wanted.boxes[:, :3], atol=1e-6)
+
+
+def test_another_clock_world_and_order_of_the_boxes_give_the_same_tracks() -> None:
+    """Turned by half: at other angles the sigma points lie elsewhere, which moves tracks by some millimeters."""
+    T_there_here = np.diag([-1.0, -1.0, 1.0, 1.0])
+    T_there_here[:3, 3] = 300.0, -200.0, 40.0
+    here, there, chance = Tracker(), Tracker(), np.random.default_rng(0)
+    for k, (seen, pose) in enumerate(drive(40)):
+        # Of two equals in one place, the first one stays.
+        boxes = [replace(box, score=chance.uniform(0.6, 0.95)) for box in seen]
+        shuffled = [boxes[j] for j in chance.permutation(len(boxes))]
+        found, other = here.update(boxes, 0.1 * k, pose), there.update(shuffled, 1e4 + 0.1 * k, T_there_here @ pose)
+        wanted, rows = (
+            np.column_stack([tracks.boxes, tracks.scores, [track.state[2] for track in tracks]])[
+                np.argsort(tracks.boxes[:, 0])
+            ]
+            for tracks in (found, other)
+        )
+        np.testing.assert_allclose(rows, wanted, atol=1e-3)
+
+
 def test_without_poses_traffic_that_moves_one_way_does_not_take_the_sensor_along() -> None:
     rng, tracker = np.random.default_rng(0), Tracker()
     parked = np.column_stack([rng.uniform(5.0, 60.0, 12), rng.choice([-6.0, 9.0], 12)])

@@ -31,7 +31,8 @@ def sectors(
 def isolated(
     points: np.ndarray, eye: np.ndarray, wedge: float, most: int, dim: float, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Twin of `health.mark_isolated`: counts (4, 3), and the points with at most ``most`` others."""
+    """Twin of `health.mark_isolated`: counts (4, 3), and the points with at most ``most`` others in other
+    places."""
     counts, mark = np.zeros((4, 3), np.int64), np.zeros(len(points), np.bool_)
     xyz = points[:, :3].astype(np.float64) - eye
     with np.errstate(invalid="ignore", over="ignore"):
@@ -44,7 +45,7 @@ def isolated(
         squares = ((points[chosen, :3].astype(np.float64) - points[i, :3].astype(np.float64)) ** 2).sum(axis=1)
         counts[side, 0] += 1
         is_dim = bool(points[i, 3] < dim)
-        if np.count_nonzero(squares <= around * around) - 1 <= most + is_dim:
+        if np.count_nonzero((squares > 0.0) & (squares <= around * around)) <= most + is_dim:
             counts[side, 1] += 1
             counts[side, 2] += is_dim
             mark[i] = True
