@@ -360,6 +360,16 @@ def test_info_prints_the_mounting_and_writes_a_profile(drive: Path, tmp_path: Pa
     assert estimate["roll_sd_deg"] > 0.0
 
 
+def test_the_written_mounting_is_that_of_a_run_without_it(tmp_path: Path, shell: Shell) -> None:
+    scan, written = write_simulated(tmp_path / "0.bin", "hdl-64e", 1), tmp_path / "mine.json"
+    printed = " ".join(shell.out("info", scan, "--write", written).split())
+    assert "pitch 0.1 deg +- 0.3" in printed
+    assert "within what streets differ by: taken as the training vehicle's, height 1.73 m, roll 0.0 deg" in printed
+    of_run, of_profile = (shell.records("run", scan, *given, "--json")[0] for given in ((), ("--sensor", written)))
+    for name in ("mounting", "boxes", "point_counts"):
+        assert of_profile[name] == of_run[name]
+
+
 def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, shell: Shell) -> None:
     metadata, fit = tmp_path / "drive.json", ("--sensor", "hdl-64e", "--out")
     metadata.write_text('{"beam_altitude_angles": [1, 2]}')
