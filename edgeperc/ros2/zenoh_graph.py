@@ -21,6 +21,7 @@ import os
 import struct
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -81,6 +82,13 @@ class ZenohGraph:
                 f"{os.environ.get(CONFIG_VARIABLE)!r} ({' '.join(str(exc).split())}); expected an endpoint such as "
                 f"{ROUTER}, or the path of a JSON5 file"
             ) from exc
+        where = connect or os.environ.get(CONFIG_VARIABLE) or ROUTER
+        if not [*self._session.info.routers_zid(), *self._session.info.peers_zid()]:
+            warnings.warn(
+                f"no router and no peer answers yet ({where}), so no cloud can come; the node goes on trying. Start "
+                "the router, ros2 run rmw_zenoh_cpp rmw_zenohd, or pass connect= (on the command line --connect).",
+                stacklevel=2,
+            )
         self._n_entities = 0
         self._kept: list[Any] = []  # a token lives as long as its object
         self._declare("NN")

@@ -178,6 +178,14 @@ def test_what_is_no_graph(
         ZenohGraph(**options)
 
 
+def test_that_no_router_answers_is_said(router: str) -> None:
+    with socket.create_server(("localhost", 0)) as server:
+        nobody = f"tcp/localhost:{server.getsockname()[1]}"
+    with pytest.warns(UserWarning, match=rf"no router and no peer answers yet \({nobody}\)"):
+        ZenohGraph(connect=nobody).close()
+    ZenohGraph(connect=router).close()
+
+
 def test_the_command_of_the_page_answers_another_process(router: str, watch: Watch, tmp_path: Path) -> None:
     """One process publishes simulated scans, one is the node; their messages are those that are made here."""
     pytest.importorskip("onnxruntime")
