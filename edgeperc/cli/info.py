@@ -531,7 +531,7 @@ def _suiting_models(
             sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
             texts = [f"as a scan of {sensor.name}: {sentence}" for sentence in sentences]
         findings[card.name] = sentences
-        for text in texts or [f"suits this scan, taken as one of {sensor.name}"]:
+        for text in texts or [f"for scans such as this one, taken as one of {sensor.name}"]:
             said.setdefault(text, []).append(card.name)
     rows = [("models", f"{', '.join(names)}: {text}") for text, names in said.items()]
     return rows, findings
