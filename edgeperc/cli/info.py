@@ -500,10 +500,12 @@ def _mounting_text(estimator: MountingEstimator) -> str:
         return f"{found}; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level"
     if used == found.mounting:
         return str(found)
-    return (
-        f"{found}; within what streets differ by: taken as the training vehicle's, height {used.height_m:.2f} m, "
-        f"roll {used.roll_deg:.1f} deg, pitch {used.pitch_deg:.1f} deg"
+    taken = (
+        f"height {used.height_m:.2f} m" * (found.height_sd_m > 0.0),  # else it was given
+        f"roll {used.roll_deg:.1f} deg" * (found.roll_sd_deg > 0.0),
+        f"pitch {used.pitch_deg:.1f} deg" * (found.pitch_sd_deg > 0.0),
     )
+    return f"{found}; within what streets differ by: taken as the training vehicle's, {', '.join(filter(None, taken))}"
 
 
 def _suiting_models(

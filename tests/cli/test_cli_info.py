@@ -365,7 +365,9 @@ def test_the_written_mounting_is_that_of_a_run_without_it(tmp_path: Path, shell:
     printed = " ".join(shell.out("info", scan, "--write", written).split())
     assert "pitch 0.1 deg +- 0.3" in printed
     assert "within what streets differ by: taken as the training vehicle's, height 1.73 m, roll 0.0 deg" in printed
-    of_run, of_profile = (shell.records("run", scan, *given, "--json")[0] for given in ((), ("--sensor", written)))
+    given = " ".join(shell.out("info", scan, "--mount-height", "1.7").split())
+    assert "taken as the training vehicle's, roll 0.0 deg, pitch 0.7 deg beams" in given
+    of_run, of_profile = (shell.records("run", scan, *more, "--json")[0] for more in ((), ("--sensor", written)))
     for name in ("mounting", "boxes", "point_counts"):
         assert of_profile[name] == of_run[name]
 
