@@ -570,7 +570,7 @@ class Perceiver:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
             if place is not None:
                 perception = replace(perception, origin_m=place)
-            found: dict[str, str] = {}
+            found = findings.by_kind(perception.fitness)
             if perception.dropped.too_near:
                 found["too near"] = about_too_near(perception.dropped, perception.n_points, self.sensor)
             detector = None if scan is None or self._pipeline is None else self._pipeline.pillars
@@ -580,7 +580,7 @@ class Perceiver:
                 found |= findings_of(perception.health)
             news = [text for kind, text in found.items() if kind not in self._told_of]
             self._told_of |= {*found}
-        for sentence in (*perception.fitness, *news):
+        for sentence in news:
             warnings.warn(sentence, stacklevel=2)
         return perception
 

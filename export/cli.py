@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, replace
@@ -431,7 +432,7 @@ def _quantize(args: argparse.Namespace) -> None:
     print_line(json.dumps(dict(card.parity)))
     print_line(
         "a file runs as it is, by its path; what it loses on your scans is said, and written into its card, by: "
-        f"edgeperc-export agree {args.model} {args.out}"
+        f"edgeperc-export agree {shlex.join([str(args.model), str(args.out)])} --labeled FOLDER"
     )
 
 

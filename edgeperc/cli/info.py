@@ -80,7 +80,8 @@ def add_parser(commands: Commands) -> None:
     output("--json", "print one JSON object for each thing: a model's whole card, a scan's measurements")
     output(
         "--write FILE",
-        "write the sensor's profile with the mounting that the scans show, a .json file for --sensor (default: none)",
+        "write the sensor's profile with the mounting that a run of the scans takes, a .json file for --sensor "
+        "(default: none)",
     )
 
 
@@ -148,8 +149,9 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
         return True
     ((sensor, estimator),) = estimators.items()
     try:
+        estimator.estimate()
         unsure: dict[str, Any] = dict.fromkeys(estimator.doubtful())  # is found from later scans
-        profile = replace(sensor, mounting=replace(estimator.estimate().mounting, **unsure))
+        profile = replace(sensor, mounting=replace(estimator.mounting(), **unsure))  # as a run of these scans takes it
     except MountingError as exc:
         print_error(f"--write: {exc}")
         return True
@@ -492,9 +494,18 @@ def _mounting_rows(
 
 def _mounting_text(estimator: MountingEstimator) -> str:
     """The estimate, and what of it is not used."""
+    found, used = estimator.estimate(), estimator.mounting()
     unsure = [name.removesuffix("_deg") for name in estimator.doubtful()]
-    level = f"; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level" if unsure else ""
-    return f"{estimator.estimate()}{level}"
+    if unsure:
+        return f"{found}; the ground is too uneven to be sure of {' and '.join(unsure)}: taken as level"
+    if used == found.mounting:
+        return str(found)
+    taken = (
+        f"height {used.height_m:.2f} m" * (found.height_sd_m > 0.0),  # else it was given
+        f"roll {used.roll_deg:.1f} deg" * (found.roll_sd_deg > 0.0),
+        f"pitch {used.pitch_deg:.1f} deg" * (found.pitch_sd_deg > 0.0),
+    )
+    return f"{found}; within what streets differ by: taken as the training vehicle's, {', '.join(filter(None, taken))}"
 
 
 def _suiting_models(
@@ -522,7 +533,7 @@ def _suiting_models(
             sentences = [*unit, *with_raw_remission(fitness, recorded, sensor), *reported]
             texts = [f"as a scan of {sensor.name}: {sentence}" for sentence in sentences]
         findings[card.name] = sentences
-        for text in texts or [f"suits this scan, taken as one of {sensor.name}"]:
+        for text in texts or [f"for scans such as this one, taken as one of {sensor.name}"]:
             said.setdefault(text, []).append(card.name)
     rows = [("models", f"{', '.join(names)}: {text}") for text, names in said.items()]
     return rows, findings

@@ -160,6 +160,12 @@ def lines_last(lines: Sequence[str], *, gray: bool = False) -> Iterator[None]:
 
 def make_folder(folder: Path, option: str) -> None:
     """Make a folder of results. Raises OptionError, which names its option."""
+    _make(folder, option)
+    if not os.access(folder, os.W_OK):
+        raise OptionError(f"{option}: the folder {folder} is read-only; expected one that can be written")
+
+
+def _make(folder: Path, option: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
@@ -177,7 +183,7 @@ def make_places(*files: Path | None) -> None:
 
     given = [file for file in files if file is not None]
     for file in given:
-        make_folder(file.parent, str(file))
+        _make(file.parent, str(file))
         if file.is_dir():
             raise OptionError(f"{file} is a folder; expected the name of a file, which may be in it")
         if (file.suffix.lower() in SCAN_SUFFIXES and file.exists()) or given.count(file) > 1:

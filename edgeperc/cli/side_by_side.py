@@ -26,7 +26,7 @@ from ..errors import EdgepercError
 from ..system.atomic import write_atomic
 from ..system.pool import MOST_FIRST, Lost
 from ..system.printable import many
-from ..system.ray_cluster import ENGINES
+from ..system.ray_cluster import ENGINES, load_ray
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR
 from .arguments import options, positive
@@ -98,12 +98,16 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
 
 
 def check_scan_files(arguments: argparse.Namespace, scans: Sequence[Path | Remote]) -> None:
-    """Check that worker processes, if any, get scan files alone."""
+    """Check that worker processes, if any, get scan files alone, and that there is Ray, before the first scans, which
+    this process perceives.
+    """
     for scan in scans if has_workers(arguments) else ():
         if is_recording(scan) or (isinstance(scan, Path) and scan.is_dir()):
             arguments.usage_error(
                 f"{_asked_by(arguments)} takes scan files; {scan} is a capture, which is decoded in its order"
             )
+    if arguments.engine == "ray":
+        load_ray()
 
 
 def perceive_side_by_side(

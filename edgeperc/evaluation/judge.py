@@ -224,17 +224,20 @@ class Judge:
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
             pairs = evaluator.update(detected, to_find, ignored=ignored, drive=truth.drive)
+        around: list[tuple[Box | None, Box | None]] = []
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
         to_find, ignored = boxes_to_find(returns, None, every, known=truth.knows)
         for group, (names, least_iou) in ALL_ROUND.items():
             evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=names)
             guesses, rights = ([box for box in boxes if box.label in names] for boxes in (predicted, to_find))
-            evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
+            around += evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
         returns_of = {id(box): n for box, n in returns}
+        found = {id(right): right for guess, right in (*pairs, *around) if guess and right}
+        missed = (right for guess, right in pairs if right and not guess and id(right) not in found)
         return replace(
             mistakes,
-            found=tuple(right for guess, right in pairs if guess and right),
-            missed=tuple((right, returns_of[id(right)]) for guess, right in pairs if right and not guess),
+            found=tuple(found.values()),
+            missed=tuple((right, returns_of[id(right)]) for right in missed),
             false=tuple(guess for guess, right in pairs if guess and not right),
         )
 
@@ -254,8 +257,8 @@ class Judge:
     def _count_points(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, predicted: PointLabels, mistakes: Mistakes
     ) -> Mistakes:
-        """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects of classes without
-        evaluated boxes count as found if at least half of their points have their label.
+        """Count labels of points, of pixels before refinement, and causes of wrong ones. Objects that no
+        box finds, beyond the view of boxes, count as found if at least half of their points have their label.
         """
         assert self.from_sensor is not None
         assert truth.labels is not None

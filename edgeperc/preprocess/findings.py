@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -35,6 +36,14 @@ def _gross(text: str) -> Finding:
 def _alone(text: str) -> tuple[Finding, ...]:
     """All there is to say of a scan that is refused."""
     return (_gross(text),)
+
+
+_NUMBER = re.compile(r"\d[\d.,]*")
+
+
+def by_kind(texts: Iterable[str]) -> dict[str, str]:
+    """Sentences by what they say but for their numbers, which differ from scan to scan."""
+    return {_NUMBER.sub("", text): text for text in texts}
 
 
 def check_fitness(

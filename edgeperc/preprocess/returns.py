@@ -61,7 +61,8 @@ def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile)
         f"sensor, and the profile {sensor.name} says that it measures nothing so near. They are beams without a "
         "return, such as (0, 0, 0). In this and later scans, such points are labeled 0, counted in "
         "perception.dropped, and otherwise ignored. If they are true returns, pass sensor= a profile with a smaller "
-        "min_range_m, such as dataclasses.replace(profile, min_range_m=0)."
+        "min_range_m: dataclasses.replace(profile, min_range_m=0), or on the command line --sensor the file that "
+        "edgeperc info SCAN --write gives, with this entry changed."
     )
 
 

@@ -21,6 +21,7 @@ import os
 import struct
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -81,6 +82,7 @@ class ZenohGraph:
                 f"{os.environ.get(CONFIG_VARIABLE)!r} ({' '.join(str(exc).split())}); expected an endpoint such as "
                 f"{ROUTER}, or the path of a JSON5 file"
             ) from exc
+        self._router = connect or os.environ.get(CONFIG_VARIABLE) or ROUTER
         self._n_entities = 0
         self._kept: list[Any] = []  # a token lives as long as its object
         self._declare("NN")
@@ -126,7 +128,14 @@ class ZenohGraph:
         return _ZenohOutput(publisher, hashlib.sha256(token.encode()).digest()[:16])
 
     def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
-        """Receive messages; see `Graph.subscribe`."""
+        """Receive messages; see `Graph.subscribe`. Warns if there is nobody yet to receive them from."""
+        if not [*self._session.info.routers_zid(), *self._session.info.peers_zid()]:
+            warnings.warn(
+                f"no router and no peer answers yet ({self._router}), so no message can come; the node goes on trying. "
+                "Start the router, ros2 run rmw_zenoh_cpp rmw_zenohd; or pass connect= (on the command line "
+                "--connect).",
+                stacklevel=1,  # of several subscriptions, the same
+            )
         full, kind, digest = self._topic(topic, message_type)
         # Any hash: Humble writes none, and what the bytes are is checked when they are read.
         key = f"{self._domain}{full}/{kind}/*"

@@ -22,6 +22,13 @@ from .pool import MOST_DEATHS, Worker, attempt, map_in_processes, map_to_workers
 STORE_BYTES = 256 * 2**20
 
 
+def load_ray() -> Any:
+    """Import Ray, whose usage statistics are off. Raises MissingExtraError."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns about a future default
+    return require("ray", "ray", "--engine ray")
+
+
 def map_on_ray(
     make: Callable[..., Callable[[Any], Any]],
     arguments: tuple[Any, ...],
@@ -38,9 +45,7 @@ def map_on_ray(
     """
     if not items:
         return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns about a future default
-    ray = require("ray", "ray", "--engine ray")
+    ray = load_ray()
     started = not ray.is_initialized()
     if started:
         local: dict[str, Any] = {}

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..camera.calibration import Calibration
 from ..camera.painting import UNSEEN, camera_road, paint
+from ..system.printable import many
 from ..types.frame import ModelFrame
 from ..types.perception import Box, Perception, TopView, scan_of
 from ..types.points import Bytes, Floats, Labels, Points
@@ -82,10 +83,13 @@ def draw_painted(
     bottom = _TOP + max(2.0 * height + _GAP, 740.0)
     counts = np.bincount(painted, minlength=256)
     facts = {
-        name: [f"{100.0 * n / labels.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
+        name: [f"{100.0 * n / labels.labels.size:.1f} %"] + [many(int(counts[k]), "point")] * bool(counts[k])
         for k, (name, n) in enumerate(labels.counts().items())
         if n
     }
+    told = {color_of(name) for name in facts}
+    kinds = dict.fromkeys(box.label for box in perception.boxes if color_of(box.label) not in told)
+    facts |= {name: ["boxes alone"] for name in kinds}
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 84)
     colors = pixel_colors(labels.classes)
     write_heading(figure, _MARGIN, _TOP - 20, "the camera", "a class for every pixel")

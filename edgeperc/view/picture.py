@@ -25,6 +25,7 @@ _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
 _AROUND_M = (48.0, 36.0)  # ahead and behind, to each side
+_AHEAD_M = ((6.0, 46.0), (-10.0, 10.0))  # x and y of what is shown at least without a top view
 _SENSOR = [[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]]  # the arrowhead that stands for it in panels from above: y, x [m]
 
 Place = tuple[float, float, float, float]
@@ -61,8 +62,8 @@ def draw(perception: Perception, points: ArrayLike, path: str | Path | None = No
     Parameters
     ----------
     perception : Perception
-        Without a top view, the picture has no panel from above. The panels show the whole turn if something behind the
-        sensor was perceived: a box from above, a class for points in the range image.
+        The panels show the whole turn if something behind the sensor was perceived: a box from above, a class for
+        points in the range image. Without it and without a top view, the picture has no panel from above.
     points : (n, 4) or (n, 3) array_like, or a structured array
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
         not finite or farther than 1 km.
@@ -109,9 +110,8 @@ def draw(perception: Perception, points: ArrayLike, path: str | Path | None = No
     notes_top = legend_top + canvas.height_of_legend(facts) + 30
     figure = canvas.new_figure(_WIDTH, notes_top + 52 + 26 * len(warnings))
 
-    drawn, left = _Drawn(points, names, painted, top_view, road, boxes, ground), float(_MARGIN)
-    if top_view is not None and road is not None:
-        left = _MARGIN + _AXIS + _draw_top_view(figure, drawn, top_view, road) + 34.0
+    drawn = _Drawn(points, names, painted, top_view, road, boxes, ground)
+    left = _MARGIN + _draw_from_above(figure, drawn)
     width = _WIDTH - _MARGIN - left
     _draw_from_behind(figure, (left, _TOP, width, 520), drawn)
     part = ("90° ahead" if turn_deg == 90.0 else "all around") + ", a class for every point" * (found is not None)
@@ -238,19 +238,57 @@ def axes_from_above(figure: Any, room: Place, bounds: Place, all_around: bool) -
     return axes, (low, high, right, left)
 
 
-def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhead) -> float:
-    """Draw the panel from above; return its width [px]. Points of the surroundings have the color of their class."""
-    from matplotlib.patches import Polygon, Rectangle
+def _draw_from_above(figure: Any, drawn: _Drawn) -> float:
+    """Draw the panel from above; return its width [px], 0 without a top view and with nothing behind the sensor.
+    Points of the surroundings have the color of their class.
+    """
+    from matplotlib.patches import Polygon
 
-    points, boxes = drawn.points, drawn.boxes
-    (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
+    points, boxes, top_view = drawn.points, drawn.boxes, drawn.top_view
+    (x_near, x_far), (y_right, y_left) = _AHEAD_M if top_view is None else (top_view.x_range_m, top_view.y_range_m)
     low = min(-2.5, x_near - 2.5)
     of_scene = np.array([name in STATIC for name in drawn.names])[drawn.painted]
     behind = any(box.center[0] < low for box in boxes) or bool((points[of_scene, 0] < low).any())
+    if top_view is None and not behind:
+        return 0.0
     room = (_MARGIN + _AXIS, _TOP, 560.0, float(_BOTTOM - _TOP))
     axes, bounds = axes_from_above(figure, room, (low, x_far + 2.0, y_right - 4.0, y_left + 4.0), behind)
     low, high, right, left = bounds
+    x, y, z = points[:, :3].astype(np.float64).T
+    inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
+    inside = inside[np.argsort(z[inside], kind="stable")]
+    shade = ramp(drawn.above_m[inside], -0.2, 2.5)
+    shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
+    axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, marker="o", linewidths=0, zorder=2)
 
+    labels: list[canvas.Label] = []
+    for box in sorted(boxes, key=lambda box: math.hypot(*box.center[:2])):
+        color, footprint = color_of(box.label), box.corners()
+        axes.add_patch(Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5))
+        front = footprint[[0, 3]].mean(axis=0)
+        axes.plot([box.center[1], front[1]], [box.center[0], front[0]], color=color, linewidth=2.4, zorder=5)
+        if low <= box.center[0] <= high and right <= box.center[1] <= left:
+            area = canvas.area_of(axes, footprint[:, ::-1])
+            labels.append(canvas.Label(area, f"{box.label} {box.score:.2f}", color))
+    n_farther, taken = len(boxes) - len(labels), [canvas.area_of(axes, _SENSOR)]
+    if top_view is not None and drawn.road is not None:
+        _draw_cells(axes, top_view)
+        taken.append(_draw_free_ahead(axes, drawn.road, x_near, labels))
+    n_omitted = canvas.place_labels(axes, labels, taken)
+    seen = f"{n_farther} farther" if n_farther else "scores"
+    if n_omitted:  # all is wider than the panel
+        seen = _omitted(seen, n_omitted)
+    elif top_view is not None:
+        seen = f"{seen}; gray: not observed"
+    canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
+    return float(axes.get_window_extent().width) + _AXIS + 34.0
+
+
+def _draw_cells(axes: Any, top_view: TopView) -> None:
+    """Draw the classes of the cells from above, what was not observed, and where they are."""
+    from matplotlib.patches import Rectangle
+
+    (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
     layer = np.zeros((*top_view.labels.shape, 4))
     for k, name in enumerate(top_view.classes):
         if k:
@@ -261,30 +299,17 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
         unobserved &= ~top_view.between_beams
     layer[unobserved] = (*rgb([FAINT])[0], 0.22)
     canvas.show(axes, layer, extent=(y_left, y_right, x_near, x_far), interpolation="nearest", zorder=1)
-    x, y, z = points[:, :3].astype(np.float64).T
-    inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
-    inside = inside[np.argsort(z[inside], kind="stable")]
-    shade = ramp(drawn.above_m[inside], -0.2, 2.5)
-    shade[of_scene[inside]] = drawn.colors[inside][of_scene[inside]]
-    axes.scatter(y[inside], x[inside], s=1.8, c=shade, alpha=0.8, marker="o", linewidths=0, zorder=2)
     size = y_left - y_right, x_far - x_near
     axes.add_patch(Rectangle((y_right, x_near), *size, fill=False, edgecolor=FAINT, linestyle="--"))
 
+
+def _draw_free_ahead(axes: Any, road: RoadAhead, x_near: float, labels: list[canvas.Label]) -> Place:
+    """Draw from above how far it is free ahead and what ends it, and add their labels; return the arrow's area."""
     strip = road.free_ahead(_HALF_STRIP_M)
     text, arrow = _strip(strip, x_near)
     if arrow is not None:
         _draw_arrow(axes, arrow[:, ::-1], 4)
-    labels: list[canvas.Label] = []
     beside_arrow = canvas.area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
-    for box in sorted(boxes, key=lambda box: math.hypot(*box.center[:2])):
-        color, footprint = color_of(box.label), box.corners()
-        axes.add_patch(Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5))
-        front = footprint[[0, 3]].mean(axis=0)
-        axes.plot([box.center[1], front[1]], [box.center[0], front[0]], color=color, linewidth=2.4, zorder=5)
-        if low <= box.center[0] <= high and right <= box.center[1] <= left:
-            area = canvas.area_of(axes, footprint[:, ::-1])
-            labels.append(canvas.Label(area, f"{box.label} {box.score:.2f}", color))
-    n_farther = len(boxes) - len(labels)
     for kind, x_m in (("obstacle", strip.obstacle_m), ("edge", strip.edge_m), ("unknown", strip.unknown_m)):
         if math.isfinite(x_m):
             axes.plot([-_HALF_STRIP_M, _HALF_STRIP_M], [x_m, x_m], color=INK, linewidth=1.5, zorder=4)
@@ -293,11 +318,7 @@ def _draw_top_view(figure: Any, drawn: _Drawn, top_view: TopView, road: RoadAhea
     if text:
         first = 0 if arrow is None else len(labels)  # without an arrow, no other panel says it
         labels.insert(first, canvas.Label(beside_arrow, text, AMBER if arrow is None else INK))
-    n_omitted = canvas.place_labels(axes, labels, [canvas.area_of(axes, _SENSOR), beside_arrow])
-    seen = f"{n_farther} farther" if n_farther else "scores"
-    seen = _omitted(seen, n_omitted) if n_omitted else f"{seen}; gray: not observed"  # all is wider than the panel
-    canvas.write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
-    return float(axes.get_window_extent().width)
+    return beside_arrow
 
 
 def _omitted(text: str, n_omitted: int) -> str:
@@ -405,7 +426,7 @@ def _draw_from_behind(figure: Any, place: Place, drawn: _Drawn) -> None:
             distance_m = math.hypot(*box.center[:2])
             labels.append(canvas.Label((*low.tolist(), *high.tolist()), f"{box.label} {distance_m:.0f} m", color))
     n_omitted = canvas.place_labels(axes, labels[::-1])
-    more = "drivable area, boxes and their distance"
+    more = "boxes and their distance" if top_view is None else "drivable area, boxes and their distance"
     canvas.write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
 
 

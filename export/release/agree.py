@@ -196,8 +196,10 @@ def _measure(
         records.setdefault(block, []).append(judge.compare(truth, found, boxes)[0])
         labels.append(found.points.labels if found.points is not None else found.require_top_view().labels.ravel())
     if not labels:
+        named = [str(root) for root in (kitti, semantickitti) if root is not None]
+        where = f" in {' or '.join(named)}" if named else ": no data set was named"
         raise PointsError(
-            f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set, or a labeled one"
+            f"no labeled scan of {split} drives{where}; name a KITTI object set (--kitti) or a labeled one (--labeled)"
         )
     blocks = [figures(of_block, 0) for of_block in records.values()]
     ious = [iou for block in blocks for iou in _ious(block)]

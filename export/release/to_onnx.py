@@ -106,7 +106,7 @@ def terms_of(sets: Iterable[str]) -> str:
 def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     """The card's record of the training."""
     frames = notes["frames"]
-    simulated = f"{notes['n_simulated']} simulated scans"
+    simulated = f"{notes['n_simulated']} simulated scans{' in the last run' if notes['before'] else ''}"
     data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
     camera = recipe.task == "camera"
     if camera:

@@ -23,6 +23,7 @@ import twins.painting
 import twins.returns
 from cli_helpers import Shell
 from edgeperc import (
+    Box,
     Calibration,
     CalibrationError,
     ImageError,
@@ -361,6 +362,17 @@ def test_what_does_not_fit_is_refused() -> None:
         paint(labels, points, NEAR, sensor="hdl-65e")
     with pytest.raises(OptionError, match="mounting"):
         paint(labels, points, NEAR, mounting="roof")  # type: ignore[arg-type]
+
+
+def test_the_legend_has_the_classes_of_boxes_that_the_camera_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    scan, image = seen(0, "hdl-64e", NEAR)
+    boxes = tuple(Box(label, 0.9, (12.0, 0.0, -0.8), (4.0, 1.7, 1.6), 0.0) for label in ("car", "van", "van"))
+    legend: dict[str, list[str]] = {}
+    monkeypatch.setattr("edgeperc.view.canvas.draw_legend", lambda *given: legend.update(given[-1]))
+    draw_painted(replace(perceived(scan, image), boxes=boxes), image.rgb, scan.points, NEAR)
+    assert legend["van"] == ["boxes alone"]
+    assert "car" not in legend
 
 
 def test_draw_painted(tmp_path: Path) -> None:

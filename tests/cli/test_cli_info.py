@@ -360,6 +360,29 @@ def test_info_prints_the_mounting_and_writes_a_profile(drive: Path, tmp_path: Pa
     assert estimate["roll_sd_deg"] > 0.0
 
 
+def test_the_written_mounting_is_that_of_a_run_without_it(tmp_path: Path, shell: Shell) -> None:
+    scan, written = write_simulated(tmp_path / "0.bin", "hdl-64e", 1), tmp_path / "mine.json"
+    printed = " ".join(shell.out("info", scan, "--write", written).split())
+    assert "pitch 0.1 deg +- 0.3" in printed
+    assert "within what streets differ by: taken as the training vehicle's, height 1.73 m, roll 0.0 deg" in printed
+    given = " ".join(shell.out("info", scan, "--mount-height", "1.7").split())
+    assert "taken as the training vehicle's, roll 0.0 deg, pitch 0.7 deg beams" in given
+    of_run, of_profile = (shell.records("run", scan, *more, "--json")[0] for more in ((), ("--sensor", written)))
+    for name in ("mounting", "boxes", "point_counts"):
+        assert of_profile[name] == of_run[name]
+
+
+@pytest.mark.filterwarnings("default")
+def test_near_returns_are_kept_as_the_warning_says(tmp_path: Path, shell: Shell) -> None:
+    scan, written = write_simulated(tmp_path / "0.bin", "hdl-64e", 1), tmp_path / "mine.json"
+    points = np.fromfile(scan, np.float32).reshape(-1, 4)
+    np.vstack([points, np.tile(np.float32([0.6, 0.0, 0.0, 0.3]), (20, 1))]).tofile(scan)
+    assert "--sensor the file that edgeperc info SCAN --write gives" in shell.both("run", scan, code=0).err
+    shell.out("info", scan, "--write", written)
+    written.write_text(json.dumps({**json.loads(written.read_text()), "min_range_m": 0.0}))
+    assert shell.records("run", scan, "--sensor", written, "--json")[0]["dropped"]["too_near"] == 0
+
+
 def test_a_profile_replaces_no_other_file(drive: Path, tmp_path: Path, shell: Shell) -> None:
     metadata, fit = tmp_path / "drive.json", ("--sensor", "hdl-64e", "--out")
     metadata.write_text('{"beam_altitude_angles": [1, 2]}')

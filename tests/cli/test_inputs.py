@@ -113,6 +113,15 @@ def test_a_folder_that_cannot_be_made_is_named_with_its_option(
     assert capsys.readouterr().err.count(f"the folder {tmp_path / out} cannot be made") == 2
 
 
+def test_a_read_only_folder_is_named_before_the_first_scan(
+    tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    for given in (("--labels", "--out", tmp_path), ("--movable", "--static", tmp_path)):
+        assert f"the folder {tmp_path} is read-only" in shell.err("run", scan, *given, code=2)
+
+
 @pytest.mark.parametrize(
     ("model", "options", "said"),
     [

@@ -778,6 +778,14 @@ def test_mistakes_are_named(world: World) -> None:
     assert mistakes.n_errors == pytest.approx(4 + 26 / 34)
 
 
+def test_what_a_box_beside_the_view_finds_is_no_mistake(world: World) -> None:
+    beside = box(20, 14)
+    world.boxes = (beside,)
+    judge = Judge(["pointseg", "ssadnet"])
+    _, mistakes = judge.record(judge.kitti(frame(beside, points=hits(beside, 7, 0))))
+    assert (mistakes.found, mistakes.missed, mistakes.false) == ((beside,), (), ())
+
+
 def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = [f"{k:06d}" for k in range(30)]
     root = kitti_set(tmp_path, dict.fromkeys(names, "2011_09_26_drive_0011"))

@@ -60,7 +60,7 @@ def test_files_must_be_of_one_network_and_one_in_fp32(tmp_path: Path) -> None:
         with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
             agree(models, kitti=None)
     path = Path(shutil.copy(model_path("pointseg"), tmp_path))
-    with pytest.raises(PointsError, match="name a KITTI object set"):
+    with pytest.raises(PointsError, match="drives: no data set was named; name a KITTI object set"):
         agree([path], kitti=None)
     (tmp_path / "training/label_2").mkdir(parents=True)
     (tmp_path / "training/label_2/000000.txt").touch()  # of a drive of its own, for training and testing

@@ -802,6 +802,7 @@ def test_make_also_makes_the_models_that_it_starts_from(
         "edgeperc eval KITTI simulation --model pointseg-full --fold 0 --no-agreement",
     ]
     assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
+    assert [card.training["data"].endswith("in the last run") for card in cards] == [False, True]
     assert cards[1].fitness == read_checkpoint(made.with_suffix("") / "checkpoint.pt")["fitness"].to_dict()
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
     taught = make("pointseg", out, fold=0, **arguments)

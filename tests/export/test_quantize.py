@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -373,7 +374,7 @@ def test_what_is_for_sparse_sensors_is_calibrated_on_their_scans() -> None:
 def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
     tmp_path: Path, small: Path, scans: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, shell: Shell
 ) -> None:
-    out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
+    out, scan = tmp_path / "its int8.onnx", tmp_path / "scan.bin"
     scans[0].tofile(scan)
     arguments = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
     monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
@@ -384,6 +385,8 @@ def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
     printed = shell.out(*arguments).splitlines()
     assert "small 1.0.0, kept in fp32: " in printed[0]
     assert json.loads(printed[1])["n_scans"] == 4
+    next_command = printed[2].partition(" by: ")[2]
+    assert shlex.split(next_command) == ["edgeperc-export", "agree", str(small), str(out), "--labeled", "FOLDER"]
 
 
 def test_the_mean_of_every_channel_is_that_of_fp32(small: Path, scans: list[np.ndarray]) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,6 +177,17 @@ def test_what_is_no_graph(
         monkeypatch.setenv(name, value)
     with pytest.raises(OptionError, match=said):
         ZenohGraph(**options)
+
+
+def test_that_no_router_answers_is_said(router: str) -> None:
+    with socket.create_server(("localhost", 0)) as server:
+        nobody = f"tcp/localhost:{server.getsockname()[1]}"
+    for endpoint in (nobody, router):
+        graph = ZenohGraph(connect=endpoint)
+        said = pytest.warns(UserWarning, match=rf"no router and no peer answers yet \({nobody}\)")
+        with said if endpoint == nobody else nullcontext():
+            graph.subscribe("/points", "sensor_msgs/msg/PointCloud2", lambda _: None)
+        graph.close()
 
 
 def test_the_command_of_the_page_answers_another_process(router: str, watch: Watch, tmp_path: Path) -> None:

@@ -251,6 +251,15 @@ def test_what_needs_an_order_is_refused(scans: Path, tmp_path: Path, option: str
     assert f"{asked} takes scan files" in shell.err("run", drive, *asked.split(), "--model", "pointseg")
 
 
+def test_that_ray_is_missing_is_said_before_the_first_scan(
+    scans: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    printed = shell.both("run", scans / "0.bin", "--engine", "ray", code=2)
+    assert "--engine ray needs ray, which is not installed" in printed.err
+    assert not printed.out
+
+
 def test_paths_stay_paths(tmp_path: Path) -> None:
     assert location("a/b.bin") == Path("a/b.bin")
     assert location("udp://:2368") == Path("udp://:2368")

@@ -137,14 +137,17 @@ def test_picture_shows_classes_where_they_are(drawn: bytes) -> None:
 
 
 @pytest.mark.usefixtures("matplotlib")
-@pytest.mark.parametrize("behind_m", [15.0, 44.0])
-def test_a_full_turn_is_drawn_whole(behind_m: float, scan: np.ndarray, perception: Perception) -> None:
+@pytest.mark.parametrize(("behind_m", "has_top_view"), [(15.0, True), (44.0, True), (15.0, False)])
+def test_a_full_turn_is_drawn_whole(
+    behind_m: float, has_top_view: bool, scan: np.ndarray, perception: Perception
+) -> None:
     """A box behind the sensor shows from above, and points behind it in the range image, at its ends."""
     labels, in_view = perception.require_points().labels.copy(), perception.require_points().in_view.copy()
     scan[-80:, 0], scan[-80:, 1], scan[-80:, 2] = -behind_m, np.linspace(-1.0, 1.0, 80), -0.5
     labels[-80:], in_view[-80:] = POINT_CLASSES.index("cyclist"), True
     rear = replace(CAR, label="cyclist", center=(-behind_m, 0.0, -0.8))
     turn = replace(perception, boxes=(rear,), points=PointLabels(labels, in_view, POINT_CLASSES))
+    turn = turn if has_top_view else replace(turn, top_view=None)
     found = near(pixels(view.draw(turn, scan)), "cyclist")
     row, col = 128 + int((48.0 + behind_m) * 740 / 96.0), 90 + int(36.0 * 740 / 96.0)
     assert found[row - 30 : row + 30, col - 60 : col + 60].sum() > 60
