@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -201,15 +202,7 @@ class Trajectory:
             raise OptionError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
         if maps_from not in (None, "sensor", "world"):
             raise OptionError(f"maps_from is {maps_from!r}; expected 'sensor' or 'world'")
-        path = _WAY.path("the poses", path)
-        try:
-            with path.open("rb") as file:
-                content = file.read(MAX_BYTES + 1).removeprefix(b"\xef\xbb\xbf")
-            rows = _rows(content)
-        except (OSError, ValueError) as exc:
-            raise TrackingError(
-                f"{path} cannot be read as poses ({exc}); expected lines of time, x, y, z, qx, qy, qz, qw"
-            ) from exc
+        path, content, rows = _read(path, 8, "time, x, y, z, qx, qy, qz, qw")
         norm = np.linalg.norm(rows[:, 4:], axis=1)
         is_right = (np.abs(norm - 1.0) < 1e-2) & np.isfinite(rows[:, 1:4]).all(axis=1)
         if not is_right.all():
@@ -248,6 +241,57 @@ class Trajectory:
             )
         try:
             return cls(rows[:, 0], poses)
+        except EdgepercError as exc:
+            raise type(exc)(f"{path}: {exc}") from exc
+
+    @classmethod
+    def from_kitti(
+        cls, path: str | os.PathLike[str], times_s: ArrayLike, *, T_camera_sensor: ArrayLike | None = None
+    ) -> Trajectory:
+        """Read poses in KITTI's format, which SemanticKITTI and many odometries write, too.
+
+        Parameters
+        ----------
+        path : str or path
+            Lines of the upper three rows of a pose (4, 4), row by row; ``#`` begins a comment.
+        times_s : (n,) array_like
+            The time of each line [s], such as those of ``times.txt``.
+        T_camera_sensor : (4, 4) array_like, optional
+            The place of the sensor in the camera whose poses they are, as KITTI's. None: they are the sensor's, with x
+            ahead and z up.
+
+        Returns
+        -------
+        Trajectory
+            Seen from where the sensor is if the camera is at the origin.
+
+        Raises
+        ------
+        TrackingError
+            The file cannot be read, a line is not such twelve numbers, a pose is not rigid, or by their way they are
+            those of a camera and no place is given, or the other way round.
+        StampError
+            There is not one time for each line, or they do not rise.
+        """
+        path, _, rows = _read(path, 12, "the upper three rows of a pose")
+        times = numbers_of("got times of poses that are not numbers", times_s, StampError, "seconds")
+        if times.shape != (len(rows),):
+            raise StampError(f"{path} has {len(rows):,} poses; expected a time for each, got {times.size:,}")
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+        of_camera = _OF_CAMERA @ poses @ _OF_CAMERA.T
+        if T_camera_sensor is not None:
+            place = rigid("T_camera_sensor", T_camera_sensor, TrackingError)
+            of_sensor, poses = poses, np.linalg.inv(place) @ poses @ place
+            if _fits_better(of_sensor, poses, times):
+                raise TrackingError(f"{path}: by their way, these are poses of the sensor; leave T_camera_sensor out")
+        elif _fits_better(of_camera, poses, times):
+            raise TrackingError(
+                f"{path}: by their way, these are poses of a camera (z ahead); pass T_camera_sensor=, or for --poses "
+                "KITTI's calib.txt beside the poses or the times"
+            )
+        try:
+            return cls(times, poses)
         except EdgepercError as exc:
             raise type(exc)(f"{path}: {exc}") from exc
 
@@ -423,8 +467,22 @@ def merge(
     return merged
 
 
-def _rows(content: bytes) -> Floats:
-    """The numbers in a file of poses, (n, 8); ValueError says what else it holds."""
+_OF_CAMERA = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _read(path: str | os.PathLike[str], n: int, expected: str) -> tuple[Path, bytes, Floats]:
+    """A file of poses: its content, and its numbers, (rows, n). Raises TrackingError."""
+    path = _WAY.path("the poses", path)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1).removeprefix(b"\xef\xbb\xbf")
+        return path, content, _rows(content, n)
+    except (OSError, ValueError) as exc:
+        raise TrackingError(f"{path} cannot be read as poses ({exc}); expected lines of {expected}") from exc
+
+
+def _rows(content: bytes, n: int) -> Floats:
+    """The numbers in a file of poses, (rows, n); ValueError says what else it holds."""
     text = content[:MAX_BYTES].decode("latin-1")
     first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
     if not first:
@@ -432,8 +490,8 @@ def _rows(content: bytes) -> Floats:
     if "," in first:
         raise ValueError("its values are separated by commas, as EuRoC's, whose times are nanoseconds")
     rows = np.loadtxt(io.StringIO(text), np.float64, ndmin=2)
-    if len(content) > MAX_BYTES or rows.shape[1] != 8:
-        kind = ", as KITTI's poses, which have no times" if rows.shape[1] == 12 else ""
+    if len(content) > MAX_BYTES or rows.shape[1] != n:
+        kind = {8: ", as TUM's", 12: ", as KITTI's poses, which have no times"}.get(rows.shape[1], "")
         raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line{kind}")
     return rows
 

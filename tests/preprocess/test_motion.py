@@ -239,6 +239,53 @@ def drive(turn_radps: float, speed_mps: float = 10.0, heading: float = 0.0, T_ve
     return times, poses @ (np.eye(4) if T_vehicle_sensor is None else T_vehicle_sensor)
 
 
+PLACE = np.array([[0.02, -1.0, 0.0, 0.03], [0.0, 0.0, -1.0, -0.08], [1.0, 0.02, 0.0, -0.27], [0.0, 0.0, 0.0, 1.0]])
+PLACE[:3, :3] /= math.hypot(1.0, 0.02)  # of a sensor in a camera that looks a little to the left
+PLACE[1, 2] = -1.0
+
+
+def write_kitti(path: Path, poses: Any) -> Path:
+    path.write_text("\n".join(" ".join(map(repr, pose[:3].ravel().tolist())) for pose in poses) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("turn_radps", [0.0, 0.4])
+def test_poses_in_the_format_of_kitti(turn_radps: float, tmp_path: Path) -> None:
+    """They are the sensor's, or those of a camera in which the sensor has a place; and never taken for the other."""
+    assert np.linalg.det(PLACE[:3, :3]) == pytest.approx(1.0)
+    times, poses = drive(turn_radps)
+    own = write_kitti(tmp_path / "own.txt", poses)
+    found = Trajectory.from_kitti(own, times)
+    np.testing.assert_array_equal(found.times_s, times)
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-9)
+    camera = write_kitti(tmp_path / "camera.txt", PLACE @ poses @ np.linalg.inv(PLACE))
+    found = Trajectory.from_kitti(camera, times, T_camera_sensor=PLACE)
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-9)
+    with pytest.raises(TrackingError, match=r"poses of a camera .* pass T_camera_sensor"):
+        Trajectory.from_kitti(camera, times)
+    with pytest.raises(TrackingError, match="poses of the sensor; leave T_camera_sensor out"):
+        Trajectory.from_kitti(own, times, T_camera_sensor=PLACE)
+    with pytest.raises(StampError, match="has 30 poses; expected a time for each, got 29"):
+        Trajectory.from_kitti(own, times[1:])
+    with pytest.raises(StampError, match="that rise"):
+        Trajectory.from_kitti(own, times[::-1])
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", "no line of numbers"),
+        ("0 0 0 0 0 0 0 1\n" * 2, "8 numbers in a line, as TUM's.*; expected lines of the upper three rows"),
+        ("2 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "not a rotation|rotation"),
+        ("1 0 0 nan 0 1 0 0 0 0 1 0\n" * 2, "finite"),
+    ],
+)
+def test_files_that_are_no_poses_of_kitti_are_refused(text: str, error: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(TrackingError, match=error):
+        Trajectory.from_kitti(tmp_path / "poses.txt", [0.0, 0.1])
+
+
 def write_w_first(path: Path, times: Any, poses: Any) -> Path:
     lines = write_tum(path, times, poses).read_text().splitlines()[1:]
     rows = [line.split() for line in lines]
