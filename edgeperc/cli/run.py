@@ -36,7 +36,7 @@ from .arguments import (
 from .output import make_folder, make_places, print_error, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Report
-from .scan_times import times_of, times_of_set, warn_of_rate
+from .scan_times import is_of_kitti, kitti_trajectory, times_of, times_of_set, warn_of_rate
 from .scans import (
     Scans,
     Sensors,
@@ -141,7 +141,8 @@ def add_parser(commands: Commands) -> None:
     reading(
         "--poses FILE",
         "poses of the sensor on the clock of the scans, for --deskew, --track and --sweeps: lines of time [s], x, y, z "
-        "[m] and the quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
+        "[m] and the quaternion x, y, z, w, TUM's format, or KITTI's, with the times of the scans and calib.txt beside "
+        "(default: the tracker's estimate)",
     )
     reading(
         "--quaternion",
@@ -719,8 +720,10 @@ def _trajectory(arguments: argparse.Namespace) -> Trajectory | None:
 
     if arguments.poses is None:
         return None
-    mounting = get_sensor(with_mounting(stated_sensor(arguments), arguments)).mounting
     how = {"quaternion": arguments.quaternion, "maps_from": arguments.poses_from}
+    if not any(how.values()) and is_of_kitti(poses := Path(arguments.poses)):
+        return kitti_trajectory(poses, arguments.times)
+    mounting = get_sensor(with_mounting(stated_sensor(arguments), arguments)).mounting
     return Trajectory.from_tum(arguments.poses, **how, mounting=mounting)
 
 

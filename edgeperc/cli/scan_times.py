@@ -12,13 +12,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import EdgepercError, StampError
+from ..errors import EdgepercError, StampError, TrackingError
 from ..system.printable import many
 from ..system.remote import Remote
 from .output import print_line
 from .scans import TIME_IN_NAME, is_recording, reading_options
 
 if TYPE_CHECKING:
+    from ..preprocess.motion import Trajectory
     from ..types.points import Floats
 
 _MOST_BYTES = 1 << 26
@@ -64,6 +65,41 @@ def times_of_set(scans: Sequence[Path | Remote]) -> dict[Path | Remote, float]:
     return times_s
 
 
+def is_of_kitti(poses: Path) -> bool:
+    """Whether a file of poses has the twelve numbers of KITTI's format in its first line."""
+    with poses.open("rb") as file:
+        lines = (line.partition(b"#")[0].split() for line in file.read(_MOST_HEAD).splitlines())
+    return len(next(filter(None, lines), ())) == _N_KITTI
+
+
+def kitti_trajectory(poses: Path, times: Path | None) -> Trajectory:
+    """Poses in KITTI's format: those of the camera of a ``calib.txt`` beside them or their times, else the sensor's.
+    Raises TrackingError, StampError, CalibrationError, OSError.
+    """
+    from ..camera.calibration import read_kitti_calibration
+    from ..preprocess.motion import Trajectory
+
+    folders = [poses.parent, poses.parent.parent / "sequences" / poses.stem]
+    times = times or next((path for path in (folder / "times.txt" for folder in folders) if path.is_file()), None)
+    if times is None:
+        raise StampError(
+            f"--poses {poses}: poses in KITTI's format have no times; pass those of the scans: --times FILE"
+        )
+    beside = [folder / "calib.txt" for folder in (times.parent, *folders)]
+    places = [(f"the camera of {path}", read_kitti_calibration(path)[0]) for path in beside if path.is_file()][:1]
+    errors = []
+    for whose, place in (*places, ("the sensor", None)):
+        try:
+            found = Trajectory.from_kitti(poses, _read_times(times), T_camera_sensor=place)
+        except TrackingError as exc:  # by their way, they may be those of the other
+            errors.append(exc)
+        else:
+            print_line(f"poses of {poses} are those of {whose}, at the times of {times}", sys.stderr)
+            return found
+    raise errors[0]
+
+
+_N_KITTI, _MOST_HEAD = 12, 1 << 16
 _TIMES_BESIDE = {"data": "timestamps.txt", "velodyne": "times.txt"}  # by the name of the scans' folder
 
 

@@ -262,3 +262,39 @@ def test_the_times_of_kitti_are_found(scans_in: str, file: str, lines: list[str]
     err = shell.err(*tracked, code=0)
     assert "the times beside the scans are not taken" in err
     assert "2 times for 3 scans" in err
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("of_camera", [True, False])
+def test_poses_in_the_format_of_kitti_need_no_option(
+    of_camera: bool, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The times and the calibration lie beside them, and whose they are is told by their way."""
+    root, camera = tmp_path / "sequences/00", np.eye(4)
+    camera[:3] = [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27]]
+    lines = []
+    for k in range(4):
+        write_scan(root / f"velodyne/{k:06d}.bin")
+        pose = np.eye(4)
+        pose[0, 3] = 2.0 * k
+        lines.append(" ".join(map(str, (camera @ pose @ np.linalg.inv(camera) if of_camera else pose)[:3].ravel())))
+    (root / "poses.txt").write_text("\n".join(lines))
+    (root / "times.txt").write_text("".join(f"{0.2 * k:e}\n" for k in range(4)))
+    place = " ".join(map(str, camera[:3].ravel()))
+    (root / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 700 0 600 0 0 700 180 0 0 0 1 0\nTr: {place}\n")
+    update, seen = Tracker.update, list[tuple[float, float]]()
+
+    def note(self: Tracker, boxes: Any, stamp_s: float, pose: Any = None, **how: Any) -> Any:
+        if pose is not None:  # of the first one, which compiles
+            seen.append((stamp_s, float(pose[0][3])))
+        return update(self, boxes, stamp_s, pose, **how)
+
+    monkeypatch.setattr(Tracker, "update", note)
+    tracked = ["run", root, "--anyway", "--track", "--poses", root / "poses.txt"]
+    err = shell.err(*tracked, code=0)
+    assert ("are those of the camera of" if of_camera else "are those of the sensor, at") in err
+    np.testing.assert_allclose(seen, [(0.2 * k, 2.0 * k) for k in range(4)], atol=1e-6)
+    (root / "calib.txt").unlink()
+    assert ("by their way, these are poses of a camera" in shell.err(*tracked, code=2 * of_camera)) == of_camera
+    (root / "times.txt").unlink()
+    assert "poses in KITTI's format have no times; pass those of the scans: --times FILE" in shell.err(*tracked)
