@@ -284,10 +284,11 @@ class Perceiver:
         self.agree = bool(agree) if rules is None else frozenset(rules)
         self._begin(self.sensor.mounting if mounting is None else mounting)
         cards = [card for card in map(_card_of, wanted) if card is not None]
-        with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
-            self._construct(wanted, {card.view.kind for card in cards}, provider, precision, n_threads, trusted)
+        needs = self._kernel_needs(cards)
+        with Compilation(lambda: kernels_of(needs), n_processes()):
+            self._construct(wanted, needs, provider, precision, n_threads, trusted)
 
-    def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
+    def _kernel_needs(self, cards: Sequence[ModelCard]) -> frozenset[str]:
         """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
         kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
         points, top_view, objects = "range_image" in kinds, "top_view" in kinds, "objects" in kinds
@@ -324,19 +325,19 @@ class Perceiver:
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
             "image": "camera" in kinds,
         }
-        return [name for name, is_needed in needs.items() if is_needed]
+        return frozenset(name for name, is_needed in needs.items() if is_needed)
 
     def _construct(
         self,
         wanted: Sequence[str | os.PathLike[str]],
-        kinds: set[str],
+        needs: frozenset[str],
         provider: str,
         precision: str,
         n_threads: int | None,
         trusted: bool,
     ) -> None:
         """Load the models, assemble the pipeline and compile every kernel."""
-        at_once = 2 if {"top_view", "range_image"} <= kinds else 1
+        at_once = 2 if {"road", "points"} <= needs else 1
         load = partial(
             Session, provider=provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted
         )
@@ -363,11 +364,11 @@ class Perceiver:
                 as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch()
             )
         if self._pipeline is not None:
-            warm_up(self._pipeline, self.sensor, self._fitness if self._to_check else [], self._estimator)
+            warm_up(self._pipeline, needs, self.sensor, self._fitness if self._to_check else [], self._estimator)
             if self._finds_sensor:
                 compile_votes()
                 coarse = get_sensor(COARSE_SENSOR)  # fills the gaps between its beams
-                warm_up(self._assemble(coarse) or self._pipeline, coarse, [], self._estimator)
+                warm_up(self._assemble(coarse) or self._pipeline, needs, coarse, [], self._estimator)
 
     def _load(self, sensor: SensorProfile) -> None:
         """Load the networks of a sensor."""
