@@ -491,21 +491,18 @@ class _Run:
         times: Mapping[Path | Remote, float] = MappingProxyType({}),
     ) -> None:
         from ..tracking.tracker import Tracker
+        from .straighten import Straightener
 
         self._arguments, self._perceivers, self._kinds, self._sinks = arguments, perceivers, kinds, sinks
         self._times = times
         self._tracker = Tracker() if arguments.track else None
-        self._straightener = None
+        self._straightener = Straightener(_trajectory(arguments), deskews=arguments.deskew)
         self._sweeps = self._odometry = None
-        if arguments.deskew or arguments.poses is not None:
-            from .straighten import Straightener
-
-            self._straightener = Straightener(_trajectory(arguments))
         if arguments.sweeps is not None:
             from ..readers.scan_odometry import Odometry
             from ..road.sweeps import Sweeps
 
-            self._sweeps = Sweeps(arguments.sweeps)
+            self._sweeps = None if arguments.live else Sweeps(arguments.sweeps)
             self._odometry = Odometry() if _needs_odometry(arguments) else None
         self._n = 0
         self._folder: Path | Remote | None = None
@@ -526,7 +523,7 @@ class _Run:
             sensor = self._perceivers.sensor_of(path, shown if isinstance(shown, Remote) else None)
             perceive = self._perceivers.of(sensor)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if arguments.deskew else read_scans
-            how = reading_options(path, self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
+            how = reading_options(path, arguments) | {"accumulate_s": _gathered_s(path, sensor)}
             if how["accumulate_s"] is not None and not arguments.deskew:
                 warnings.warn(
                     f"{shown}: the points of the last {how['accumulate_s']:g} s are taken as seen from one place; "
@@ -541,17 +538,14 @@ class _Run:
                 stamp_s = self._times.get(shown, stamp_s)
                 at_s = self._at_s(stamp_s)
                 try:
-                    if arguments.deskew and self._straightener is not None:
-                        points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    elif self._straightener is not None:
-                        self._straightener.place(stamp_s)
+                    points = self._straightener.straighten(stamp_s, points, *times_s, sensor=perceive.sensor)
                     pose, earlier = self._pose(points, at_s, how["origin_m"]), None
                     if self._sweeps is not None:
                         earlier = self._sweeps.earlier(points, at_s, pose)
                     perception = perceive(points, stamp_s, origin_m=how["origin_m"], earlier=earlier)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
-                    wanted = files_of(self._arguments, file, self._kinds, False)
+                    wanted = files_of(arguments, file, self._kinds, False)
                     yield self._answered(name, points, perception, perceive.sensor, wanted, at_s, pose)
                 except (EdgepercError, OSError) as exc:
                     yield name, exc, None, None
@@ -671,7 +665,7 @@ class _Run:
         tracks = None
         if self._tracker is not None and not (self._odometry is not None and pose is None):
             tracks = self._tracker.update(perception.boxes, stamp_s, pose, mounting=perception.mounting)
-        if self._straightener is not None and tracks is not None:
+        if tracks is not None:
             self._straightener.follow(tracks)
         if self._sweeps is not None and tracks is not None:
             self._sweeps.add(points, perception, tracks)
@@ -693,7 +687,7 @@ class _Run:
         """Pose of the sensor, seen from that of the first scan: by ``--poses``, where its place in a map is known,
         whose axes are then its own, or for ``--sweeps`` by an odometry.
         """
-        if self._straightener is not None and self._straightener.pose is not None:
+        if self._straightener.pose is not None:
             return self._straightener.pose
         if origin_m is None:
             return None if self._odometry is None else self._odometry(points, stamp_s)
