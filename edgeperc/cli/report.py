@@ -17,40 +17,31 @@ from .output import in_options, one_line, print_error, print_result
 if TYPE_CHECKING:
     from ..live import Answer
     from ..tracking.tracks import Tracks
-    from ..types.mounting import Mounting
     from ..types.perception import Perception
 
 
 class Outcome(NamedTuple):
-    """Of a scan or image: the answer or an error, its tracks, and what ``--gif`` draws under them: the flattened scan
-    (`edgeperc.view.flatten_scan`) and its mounting.
-    """
+    """Of a scan or image: the answer or an error, and its tracks."""
 
     source: Path | Remote
     answer: Perception | Answer | Exception
     tracks: Tracks | None = None
-    under: tuple[bytes, Mounting] | None = None
 
 
 class Report:
-    """Prints the result of each scan, counts scans and failures, and keeps what ``--gif`` draws of every scan."""
+    """Prints the result of each scan, and counts scans and failures."""
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
         self.n = self.n_failed = 0
         self._images = images
-        self.tracks: list[Tracks] = []
-        self.under: list[tuple[bytes, Mounting]] = []
         self._json = arguments.json
         self._reported: dict[str, Path | Remote] = {}
 
     def add(self, outcome: Outcome) -> None:
         """Print one scan's line or JSON object; print an error on stderr as well."""
-        source, answer, tracks, under = outcome
+        source, answer, _ = outcome
         if isinstance(answer, MissingExtraError):
             raise answer
-        if tracks is not None and under is not None and not tracks.is_late:
-            self.tracks.append(tracks)
-            self.under.append(under)
         error = str(answer).removeprefix(f"{source}: ") if isinstance(answer, Exception) else None
         self.show(source, self.text(outcome), error)
 
@@ -75,7 +66,7 @@ class Report:
         """One scan's line or JSON object; of a failed scan without ``--json``, nothing."""
         from ..types.perception import Perception
 
-        source, found, tracks, _ = outcome
+        source, found, tracks = outcome
         if isinstance(found, Exception):
             return json.dumps({**self._names(source), "error": one_line(found)}) if self._json else ""
         answer, perception = (None, found) if isinstance(found, Perception) else (found, found.perception)

@@ -33,7 +33,7 @@ from .arguments import (
     positive,
     positive_number,
 )
-from .output import make_folder, make_places, print_error, print_line, progress
+from .output import make_folder, make_places, print_line, progress
 from .outputs import check_outputs, files_of
 from .report import Outcome, Report
 from .scan_times import times_of, times_of_set, warn_of_rate
@@ -299,16 +299,6 @@ def run_command(arguments: argparse.Namespace) -> int:
         if not (arguments.live or of_ports):
             raise
         ended = exc
-    n_failed = report.n_failed + sinks.n_failed
-    if report.tracks:
-        from ..view.tracks import draw_tracks
-
-        try:
-            under, mountings = zip(*report.under, strict=True)
-            draw_tracks(report.tracks, gif, under=under, mountings=mountings)
-        except (EdgepercError, OSError) as exc:
-            n_failed += 1
-            print_error(f"{gif}: {exc}")
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
@@ -316,7 +306,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
     if ended is not None:
         raise ended
-    return 1 if n_failed else 0
+    return 1 if report.n_failed + sinks.n_failed else 0
 
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
@@ -673,8 +663,7 @@ class _Run:
                 view.write_ply(perception, points, wanted["ply"])
         finally:  # a picture that cannot be written costs no sink its scan
             self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
-        under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
-        return Outcome(name, perception, tracks, under)
+        return Outcome(name, perception, tracks)
 
     def _pose(self, points: Points, stamp_s: float, origin_m: Sequence[float] | None) -> ArrayLike | None:
         """Pose of the sensor, seen from that of the first scan: by ``--poses``, where its place in a map is known,
