@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn, get_args
 
@@ -36,6 +35,7 @@ from .preprocess.returns import about_sensor, about_too_near, own_returns, retur
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
+from .system.fields import OPTIONS
 from .system.lanes import Calls, Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
@@ -263,20 +263,16 @@ class Perceiver:
         known = isinstance(agree, Hashable) and agree in (True, False)
         if not known if rules is None else any(name not in [*RULES] for name in rules):
             raise OptionError(f"agree is {agree!r}; expected True, False or some of {', '.join(sorted(RULES))}")
-        if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
-            raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
-        if not (n_threads is None or isinstance(n_threads, Integral)):
-            raise OptionError(f"n_threads is {n_threads!r}; expected a whole number, or None")
+        least = None if score_threshold is None else OPTIONS.number("score_threshold", score_threshold, 0.0, 1.0)
         for option, given in (("provider", provider), ("precision", precision)):
-            if not isinstance(given, str):
-                raise OptionError(f"{option} is {given!r}; expected a str")
+            OPTIONS.entry(str, given, option)
         wanted = _listed(models, weights)
         if mounting is not None and not isinstance(mounting, Mounting):
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self._finds_sensor = isinstance(sensor, str) and sensor == AUTO_SENSOR
         self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
         self.on_mismatch = on_mismatch
-        self.score_threshold = None if score_threshold is None else float(score_threshold)
+        self.score_threshold = least
         self.adapt = adapt
         self._interpolates = adapt in ("both", "interpolation")
         self._renders = adapt in ("both", "remission")
