@@ -287,7 +287,8 @@ class Perceiver:
 
     def _kernel_needs(self, cards: Sequence[ModelCard]) -> frozenset[str]:
         """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
-        kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
+        kinds: set[str] = {card.view.kind for card in cards}
+        scans = [card for card in cards if not isinstance(card.view, CameraGeometry)]
         points, top_view, objects = "range_image" in kinds, "top_view" in kinds, "objects" in kinds
         boxes = points and self.boxes_from != "network"
         agreement = points and bool(self.agree)
@@ -302,27 +303,21 @@ class Perceiver:
             "views": points or top_view,
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
             "curvature": any("curvature" in card.input.channels for card in scans),
-            "crop": points or top_view,
             "gaps": gaps,
             "turn": points and self.full_turn,
             "ground": bool(scans)
             and (bool(self.agree) or boxes or objects or any(card.input.needs_ground for card in scans)),
-            "points": points,
             "sensor": self._finds_sensor and bool(scans),
             "clusters": boxes or agreement,
             "boxes": boxes,
             "agreement": agreement,
-            "objects": objects,
             "candidates": objects and self.boxes_from != "network",
             "standing": bool(self.agree) and not objects and (boxes or detections),
-            "road": top_view,
             "cells": top_view and bool(self.agree),
             "detections": detections,
-            "pillars": "pillars" in kinds,
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
-            "image": "camera" in kinds,
         }
-        return frozenset(name for name, is_needed in needs.items() if is_needed)
+        return frozenset(kinds | {name for name, is_needed in needs.items() if is_needed})
 
     def _construct(
         self,
@@ -334,7 +329,7 @@ class Perceiver:
         trusted: bool,
     ) -> None:
         """Load the models, assemble the pipeline and compile every kernel."""
-        at_once = 2 if {"road", "points"} <= needs else 1
+        at_once = 2 if {"top_view", "range_image"} <= needs else 1
         load = partial(
             Session, provider=provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted
         )

@@ -183,7 +183,7 @@ def warm_up(
             compile_parts(["boxes"])  # some only several boxes need
         if "standing" in needs:
             rules.stand_boxes([UNCERTAIN], *_made_up())
-        if "road" in needs:
+        if "top_view" in needs:
             compile_kernels()
 
 
@@ -243,7 +243,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "clusters": Part(_compile_clusters, fill_clusters, 3.7),
         "boxes": Part(_compile_boxes, fill_rectangle, 2.7),
         "agreement": Part(_compile_agreement, rules.clear_columns, 2.9),
-        "road": Part(compile_kernels, merge_corners, 2.0),
+        "top_view": Part(compile_kernels, merge_corners, 2.0),
         "ground": Part(_compile_ground, fill_planes, 2.2),
     }
 )
