@@ -87,22 +87,23 @@ def car_and_person() -> tuple[Floats32, PointLabels]:
     return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian", "cyclist"))
 
 
-class Rehearsed(Session):
-    """A session whose runs give the outputs of its last one, at first those of the golden input."""
+class _StandIn:
+    """Stands in for another object, with all that it has."""
 
-    def __init__(self, session: Session) -> None:
-        vars(self).update(vars(session))
+    def __init__(self, other: object) -> None:
+        vars(self).update(vars(other))
+
+
+class Rehearsed(_StandIn, Session):
+    """A session whose runs give the outputs of its last one, at first those of the golden input."""
 
     def run(self, n_rows: int = 1) -> Mapping[str, Floats32]:
         """`Session.outputs`, without running the network."""
         return self.outputs
 
 
-class _RehearsedTop(TopViewNetwork):
+class _RehearsedTop(_StandIn, TopViewNetwork):
     """Gives one uncertain box in place of what its network would."""
-
-    def __init__(self, network: TopViewNetwork) -> None:
-        vars(self).update(vars(network))
 
     def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> list[Box]:
         return [UNCERTAIN] if self.card.box_classes else []
@@ -111,11 +112,8 @@ class _RehearsedTop(TopViewNetwork):
         self.index.fill(-1)
 
 
-class RehearsedRange(RangeImageNetwork):
+class RehearsedRange(_StandIn, RangeImageNetwork):
     """Gives the labels that `car_and_person` wrote into the remission of the points."""
-
-    def __init__(self, network: RangeImageNetwork) -> None:
-        vars(self).update(vars(network))
 
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         labels = np.minimum(points[:, 3], len(self.card.classes) - 1).astype(np.uint8)  # it may know one class only
