@@ -13,9 +13,9 @@ import numpy as np
 from edgeperc import Box, PointsError, SensorError, read_points
 from edgeperc.cli.scans import sensor_in
 from edgeperc.preprocess.sensor_estimate import MOST_SCANS, has_enough_points
-from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.system.names import SCAN_SUFFIXES
 from edgeperc.system.printable import many
 from edgeperc.types.choices import AUTO_SENSOR, DEFAULT_SENSOR
 from edgeperc.types.points import Floats32, Points

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn, get_args
 
@@ -36,6 +35,7 @@ from .preprocess.returns import about_sensor, about_too_near, own_returns, retur
 from .preprocess.sensor_estimate import SensorEstimate, compile_votes, estimate_sensor
 from .system.clock import as_seconds
 from .system.compilation import Compilation, kernels_of
+from .system.fields import OPTIONS
 from .system.lanes import Calls, Lanes, Stopwatch
 from .system.names import nearest
 from .types.card import ModelCard
@@ -84,7 +84,7 @@ class Learned(NamedTuple):
     mounting: MountingEstimator
     remission: RemissionMatcher
     to_check: int  # number of scans that are still compared with the training scans
-    is_settled: bool  # whether further scans change nothing: the answer to a scan then depends on this scan alone
+    is_settled: bool = False  # whether more scans change nothing: the answer to a scan then depends on this scan alone
     sensor_estimate: SensorEstimate | None = None  # what ``sensor="auto"`` found
     normal: Normal = Normal()  # what the sensor shows in clear air with a clean window
 
@@ -234,6 +234,7 @@ class Perceiver:
     cards: tuple[ModelCard, ...]
     sessions: tuple[Session, ...]
     providers: Mapping[str, str]
+    _learned: Learned
 
     def __init__(
         self,
@@ -262,20 +263,16 @@ class Perceiver:
         known = isinstance(agree, Hashable) and agree in (True, False)
         if not known if rules is None else any(name not in [*RULES] for name in rules):
             raise OptionError(f"agree is {agree!r}; expected True, False or some of {', '.join(sorted(RULES))}")
-        if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
-            raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
-        if not (n_threads is None or isinstance(n_threads, Integral)):
-            raise OptionError(f"n_threads is {n_threads!r}; expected a whole number, or None")
+        least = None if score_threshold is None else OPTIONS.number("score_threshold", score_threshold, 0.0, 1.0)
         for option, given in (("provider", provider), ("precision", precision)):
-            if not isinstance(given, str):
-                raise OptionError(f"{option} is {given!r}; expected a str")
+            OPTIONS.entry(str, given, option)
         wanted = _listed(models, weights)
         if mounting is not None and not isinstance(mounting, Mounting):
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self._finds_sensor = isinstance(sensor, str) and sensor == AUTO_SENSOR
         self.sensor = get_sensor(DEFAULT_SENSOR if self._finds_sensor else sensor)
         self.on_mismatch = on_mismatch
-        self.score_threshold = None if score_threshold is None else float(score_threshold)
+        self.score_threshold = least
         self.adapt = adapt
         self._interpolates = adapt in ("both", "interpolation")
         self._renders = adapt in ("both", "remission")
@@ -284,18 +281,20 @@ class Perceiver:
         self.agree = bool(agree) if rules is None else frozenset(rules)
         self._begin(self.sensor.mounting if mounting is None else mounting)
         cards = [card for card in map(_card_of, wanted) if card is not None]
-        with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
-            self._construct(wanted, {card.view.kind for card in cards}, provider, precision, n_threads, trusted)
+        needs = self._kernel_needs(cards)
+        with Compilation(lambda: kernels_of(needs), n_processes()):
+            self._construct(wanted, needs, provider, precision, n_threads, trusted)
 
-    def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
+    def _kernel_needs(self, cards: Sequence[ModelCard]) -> frozenset[str]:
         """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
-        kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
+        kinds: set[str] = {card.view.kind for card in cards}
+        scans = [card for card in cards if not isinstance(card.view, CameraGeometry)]
         points, top_view, objects = "range_image" in kinds, "top_view" in kinds, "objects" in kinds
         boxes = points and self.boxes_from != "network"
         agreement = points and bool(self.agree)
         detections = any(card.box_classes for card in scans if card.view.kind == "top_view")
         gaps = self._interpolates and any(
-            self._finds_sensor or Interpolator(card.view, self.sensor.upright(self._estimator.known)).needed
+            self._finds_sensor or Interpolator(card.view, self.sensor.upright(self._learned.mounting.known)).needed
             for card in scans
             if isinstance(card.view, RangeImageGeometry)
         )
@@ -304,39 +303,33 @@ class Perceiver:
             "views": points or top_view,
             "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
             "curvature": any("curvature" in card.input.channels for card in scans),
-            "crop": points or top_view,
             "gaps": gaps,
             "turn": points and self.full_turn,
             "ground": bool(scans)
             and (bool(self.agree) or boxes or objects or any(card.input.needs_ground for card in scans)),
-            "points": points,
             "sensor": self._finds_sensor and bool(scans),
             "clusters": boxes or agreement,
             "boxes": boxes,
             "agreement": agreement,
-            "objects": objects,
             "candidates": objects and self.boxes_from != "network",
             "standing": bool(self.agree) and not objects and (boxes or detections),
-            "road": top_view,
             "cells": top_view and bool(self.agree),
             "detections": detections,
-            "pillars": "pillars" in kinds,
             "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
-            "image": "camera" in kinds,
         }
-        return [name for name, is_needed in needs.items() if is_needed]
+        return frozenset(kinds | {name for name, is_needed in needs.items() if is_needed})
 
     def _construct(
         self,
         wanted: Sequence[str | os.PathLike[str]],
-        kinds: set[str],
+        needs: frozenset[str],
         provider: str,
         precision: str,
         n_threads: int | None,
         trusted: bool,
     ) -> None:
         """Load the models, assemble the pipeline and compile every kernel."""
-        at_once = 2 if {"top_view", "range_image"} <= kinds else 1
+        at_once = 2 if {"top_view", "range_image"} <= needs else 1
         load = partial(
             Session, provider=provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted
         )
@@ -363,11 +356,12 @@ class Perceiver:
                 as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch()
             )
         if self._pipeline is not None:
-            warm_up(self._pipeline, self.sensor, self._fitness if self._to_check else [], self._estimator)
+            fitness, mounting = self._fitness if self._learned.to_check else [], self._learned.mounting
+            warm_up(self._pipeline, needs, self.sensor, fitness, mounting)
             if self._finds_sensor:
                 compile_votes()
                 coarse = get_sensor(COARSE_SENSOR)  # fills the gaps between its beams
-                warm_up(self._assemble(coarse) or self._pipeline, coarse, [], self._estimator)
+                warm_up(self._assemble(coarse) or self._pipeline, needs, coarse, [], mounting)
 
     def _load(self, sensor: SensorProfile) -> None:
         """Load the networks of a sensor."""
@@ -379,7 +373,7 @@ class Perceiver:
 
     def _assemble(self, sensor: SensorProfile) -> Pipeline | None:
         """The pipeline of the LiDAR networks; None without any."""
-        sensor = sensor.upright(self._estimator.known)
+        sensor = sensor.upright(self._learned.mounting.known)
         top: TopViewNetwork | None = None
         ranged: list[RangeImageNetwork] = []
         objects: ObjectNetwork | None = None
@@ -429,14 +423,14 @@ class Perceiver:
     def mounting(self) -> MountingEstimate | None:
         """See the class."""
         try:
-            return self._estimator.estimate()
+            return self._learned.mounting.estimate()
         except MountingError:
             return None
 
     @property
     def sensor_estimate(self) -> SensorEstimate | None:
         """See the class."""
-        return self._sensor_estimate
+        return self._learned.sensor_estimate
 
     @property
     def pipeline(self) -> Pipeline | None:
@@ -450,44 +444,40 @@ class Perceiver:
         anew. With ``sensor="auto"``, the next one tells the sensor.
         """
         with self._calls.one():
-            self._begin(self._estimator.known)
+            self._begin(self._learned.mounting.known)
 
     def _begin(self, known: Mounting) -> None:
         """Be as before the first scan, of a sensor whose mounting is known as far as this says."""
-        self._sensor_estimate: SensorEstimate | None = None
-        self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
-        self._remission, self._normal = RemissionMatcher(self.sensor), Normal()
         self._has_drops = False  # of the last scan
         self._told_of: set[str] = set()  # kinds of findings
-        self._set_mounting(MountingEstimator(known))
+        to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
+        self._learn(Learned(MountingEstimator(known), RemissionMatcher(self.sensor), to_check))
 
     @property
     def learned(self) -> Learned:
         """What the scans so far have shown, for a perceiver of the same options elsewhere (`start_from`)."""
-        parts = [self._is_sensor_known, self._estimator.is_complete, self._remission.is_complete or not self._renders]
-        is_settled = all(parts) and self._to_check == 0 and (self._normal.is_complete or self._pipeline is None)
-        estimate = self._sensor_estimate
-        return Learned(self._estimator, self._remission, self._to_check, is_settled, estimate, self._normal)
+        now = self._learned
+        parts = [self._is_sensor_known, now.mounting.is_complete, now.remission.is_complete or not self._renders]
+        is_settled = all(parts) and now.to_check == 0 and (now.normal.is_complete or self._pipeline is None)
+        return now._replace(is_settled=is_settled)
 
     def start_from(self, learned: Learned) -> None:
         """Forget the scans so far, and continue from what another perceiver has learned."""
         with self._calls.one():
             if self._finds_sensor:
                 self._use(learned.remission.sensor)
-                self._sensor_estimate = learned.sensor_estimate
-            self._remission, self._to_check, self._normal = learned.remission, learned.to_check, learned.normal
-            self._set_mounting(learned.mounting)
+            self._learn(learned)
 
     @property
     def _is_sensor_known(self) -> bool:
-        return not self._finds_sensor or self._sensor_estimate is not None
+        return not self._finds_sensor or self._learned.sensor_estimate is not None
 
     def _find_sensor(self, scan: Points) -> None:
         """Use the sensor whose beams the scan has; SensorError if it does not tell."""
-        found = estimate_sensor([about_sensor(scan, self._estimator.known.origin_m)])
+        found = estimate_sensor([about_sensor(scan, self._learned.mounting.known.origin_m)])
         found.tell_doubt(self.on_mismatch)
         self._use(found.profile)
-        self._sensor_estimate = found
+        self._learned = self._learned._replace(sensor_estimate=found)
 
     def _use(self, sensor: SensorProfile) -> None:
         """Take further scans as this sensor's."""
@@ -495,12 +485,12 @@ class Perceiver:
             return
         self._load(sensor)
         vars(self)["sensor"] = sensor
-        self._remission, self._normal = RemissionMatcher(sensor), Normal()
+        self._learned = self._learned._replace(remission=RemissionMatcher(sensor), normal=Normal())
         self._pipeline = self._assemble(sensor)
 
-    def _set_mounting(self, estimator: MountingEstimator) -> None:
-        self._estimator = estimator
-        self._mounting = estimator.mounting()
+    def _learn(self, learned: Learned) -> None:
+        self._learned = learned
+        self._mounting = learned.mounting.mounting()
         self._frame = ModelFrame(self._mounting)
 
     def __call__(
@@ -563,9 +553,10 @@ class Perceiver:
                 if not self._is_sensor_known and len(scan):
                     self._find_sensor(scan)
                     watch.lap("check")
-                check = self._to_check > 0 and len(scan) > 0
+                check = self._learned.to_check > 0 and len(scan) > 0
                 perception = self._perceive(scan, stamp_s, watch, check, before)
-                self._to_check -= check
+                if check:
+                    self._learned = self._learned._replace(to_check=self._learned.to_check - 1)
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
             if place is not None:
@@ -606,38 +597,39 @@ class Perceiver:
     def _perceive(
         self, scan: Points, stamp_s: float | None, watch: Stopwatch, check: bool, earlier: Points | None
     ) -> Perception:
-        given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
+        given, before, profile = scan, self._learned, self.sensor
+        known = before.mounting.known
         hidden: tuple[findings.Finding | None, ...] = ()
         turned: tuple[findings.Finding, ...] = ()
         matched: tuple[findings.Finding, ...] = ()
-        scan, dropped = returns(given, profile, before.known.origin_m)
-        centered = about_sensor(scan, before.known.origin_m)
+        scan, dropped = returns(given, profile, known.origin_m)
+        centered = about_sensor(scan, known.origin_m)
         if self._renders:
-            self._remission, profile, matched = matcher.add(centered)
+            remission, profile, matched = before.remission.add(centered)
+            self._learned = before._replace(remission=remission)
         scan, n_overflowed = scale(scan, profile, rendered=self._renders)
         if earlier is not None:
-            earlier, _ = scale(returns(earlier, profile, before.known.origin_m)[0], profile, rendered=self._renders)
+            earlier, _ = scale(returns(earlier, profile, known.origin_m)[0], profile, rendered=self._renders)
         dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
-        roll_deg = before.known.roll_deg
-        if check and roll_deg is not None:
-            turned = findings.check_hanging(centered, near_support, share_below, before.known)
-        if not before.is_complete and len(scan):
-            if check and roll_deg is None:
+        if check and known.roll_deg is not None:
+            turned = findings.check_hanging(centered, near_support, share_below, known)
+        if not before.mounting.is_complete and len(scan):
+            if check and known.roll_deg is None:
                 turned = findings.check_beams(centered, profile) or findings.check_ground(
                     centered, near_support, share_below, profile
                 )
             try:
-                self._set_mounting(before.add(scan))
+                self._learn(self._learned._replace(mounting=before.mounting.add(scan)))
                 hidden = self._about_height(), self._about_tilt()
             except MountingError as exc:
                 hidden = (self._without_ground(exc),)
             watch.lap("check")
-        if check and (roll_deg, before.known.pitch_deg) != (None, None):
-            lying = findings.about_lying(before.known)
-            hidden = (*hidden, lying, findings.about_given_tilt(self._mounting, before.contradicted_by(scan)))
+        if check and (known.roll_deg, known.pitch_deg) != (None, None):
+            lying = findings.about_lying(known)
+            hidden = (*hidden, lying, findings.about_given_tilt(self._mounting, before.mounting.contradicted_by(scan)))
             watch.lap("check")
-        upright = profile.upright(before.known)
+        upright = profile.upright(known)
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             earlier = None if earlier is None else self._frame.move(earlier)
@@ -655,10 +647,8 @@ class Perceiver:
             try:
                 self._refuse(fitness)
             except FitnessError:
-                self._set_mounting(before)  # nothing is learnt from a refused scan
-                self._remission = matcher
-                if self._to_check == CHECKED_SCANS:  # no scan before it told the sensor
-                    self._sensor_estimate = None
+                # Nothing is learnt from a refused scan; nor the sensor, if no scan before it told that.
+                self._learn(before if before.to_check < CHECKED_SCANS else before._replace(sensor_estimate=None))
                 raise
         scan, health, parts = self._without_drops(scan, given, upright, watch, earlier)
         return Perception(
@@ -691,11 +681,11 @@ class Perceiver:
         own: Points | None = None
         if profile.ego_box is not None:
             sample = given[:: sample_step(len(given))]
-            own = self._frame.move(own_returns(sample, profile, self._estimator.known.origin_m))
-        check = partial(check_health, sensor=profile, normal=self._normal, eye_m=self._frame.eye, own=own)
+            own = self._frame.move(own_returns(sample, profile, self._learned.mounting.known.origin_m))
+        check = partial(check_health, sensor=profile, normal=self._learned.normal, eye_m=self._frame.eye, own=own)
         parts = None if self._has_drops else self._pipeline(scan, self._mounting, watch, check, earlier)
-        health, self._normal = check(scan) if parts is None else parts.beside
-        self._has_drops = health.has_drops
+        health, normal = check(scan) if parts is None else parts.beside
+        self._learned, self._has_drops = self._learned._replace(normal=normal), health.has_drops
         if health.has_drops:
             scan, n_drops = without_drops(scan, profile, self._frame.eye)
             health, parts = replace(health, n_drops=n_drops), None
@@ -714,9 +704,9 @@ class Perceiver:
 
     def _about_height(self) -> findings.Finding | None:
         """What to say of a height that was found from little ground: that of a sensor that is high, or looks up."""
-        if not self._estimator.is_height_unsure():
+        if not self._learned.mounting.is_height_unsure():
             return None
-        found = self._estimator.estimate()
+        found = self._learned.mounting.estimate()
         return findings.Finding(
             f"The sensor seems to be {found.mounting.height_m:.1f} +- {found.height_sd_m:.1f} m above the road. It "
             "sees little of the road near by, and its height may be off by a meter: pass mounting= (on the command "
@@ -725,10 +715,10 @@ class Perceiver:
 
     def _about_tilt(self) -> findings.Finding | None:
         """What to say if the scans suggest a tilt, and their ground is too uneven to be sure."""
-        doubtful = self._estimator.doubtful()
+        doubtful = self._learned.mounting.doubtful()
         if not doubtful:
             return None
-        found = self._estimator.estimate()
+        found = self._learned.mounting.estimate()
         shown = " and ".join(
             f"{name} of {getattr(found.mounting, f'{name}_deg'):.1f} +- {getattr(found, f'{name}_sd_deg'):.1f} deg"
             for name in (name.removesuffix("_deg") for name in doubtful)

@@ -87,22 +87,23 @@ def car_and_person() -> tuple[Floats32, PointLabels]:
     return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian", "cyclist"))
 
 
-class Rehearsed(Session):
-    """A session whose runs give the outputs of its last one, at first those of the golden input."""
+class _StandIn:
+    """Stands in for another object, with all that it has."""
 
-    def __init__(self, session: Session) -> None:
-        vars(self).update(vars(session))
+    def __init__(self, other: object) -> None:
+        vars(self).update(vars(other))
+
+
+class Rehearsed(_StandIn, Session):
+    """A session whose runs give the outputs of its last one, at first those of the golden input."""
 
     def run(self, n_rows: int = 1) -> Mapping[str, Floats32]:
         """`Session.outputs`, without running the network."""
         return self.outputs
 
 
-class _RehearsedTop(TopViewNetwork):
+class _RehearsedTop(_StandIn, TopViewNetwork):
     """Gives one uncertain box in place of what its network would."""
-
-    def __init__(self, network: TopViewNetwork) -> None:
-        vars(self).update(vars(network))
 
     def find_boxes(self, projected: None, score_threshold: float, named_from: float) -> list[Box]:
         return [UNCERTAIN] if self.card.box_classes else []
@@ -111,11 +112,8 @@ class _RehearsedTop(TopViewNetwork):
         self.index.fill(-1)
 
 
-class RehearsedRange(RangeImageNetwork):
+class RehearsedRange(_StandIn, RangeImageNetwork):
     """Gives the labels that `car_and_person` wrote into the remission of the points."""
-
-    def __init__(self, network: RangeImageNetwork) -> None:
-        vars(self).update(vars(network))
 
     def label(self, points: Points, height_m: Heights | None, watch: Stopwatch) -> PointLabels:
         labels = np.minimum(points[:, 3], len(self.card.classes) - 1).astype(np.uint8)  # it may know one class only
@@ -123,30 +121,28 @@ class RehearsedRange(RangeImageNetwork):
 
 
 def warm_up(
-    pipeline: Pipeline, sensor: SensorProfile, fitness: Sequence[FitnessProfile], estimator: MountingEstimator
+    pipeline: Pipeline,
+    needs: Collection[str],
+    sensor: SensorProfile,
+    fitness: Sequence[FitnessProfile],
+    estimator: MountingEstimator,
 ) -> None:
-    """Compile what a scan needs, and `edgeperc.road_ahead`, unless that was done when the package was built."""
+    """Compile what a scan needs, and `edgeperc.road_ahead`, unless that was done when the package was built.
+
+    needs : keys of `edgeperc.system.compilation.KERNELS`
+    """
     if is_ahead():
         return
     few_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
     options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
-    objects, pillars = copy(pipeline.objects), copy(pipeline.pillars)
-    boxes_points = bool(ranged) and options.boxes_from != "network"
-    needed = {
-        "ground": pipeline.needs_ground,
-        "clusters": boxes_points or bool(ranged and options.rules),
-        "agreement": bool(ranged and options.rules),
-        "boxes": boxes_points,
-        "road": top is not None,
-    }
-    alone = Lanes(1)
-    with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
+    objects, pillars, alone = copy(pipeline.objects), copy(pipeline.pillars), Lanes(1)
+    with fewer_collections(), Helpers(needs) as helpers:
         # The networks' own stages, with their outputs for the golden input
         few_points, _ = returns(few_points, sensor)
         check_health(few_points, sensor, Normal())
         render(few_points, replace(sensor, remission=NO_REMISSION))
         check_profiles(few_points, fitness, sensor)
-        if pipeline.needs_ground:
+        if "ground" in needs:
             find_ground(few_points, mount_height_m=MODEL_HEIGHT_M)  # these show none
         golden_top, golden_ranged = copy(top), [copy(network) for network in ranged]
         for network in (golden_top, *golden_ranged):
@@ -181,11 +177,11 @@ def warm_up(
             pillars,
         )
         rehearsed(read_only(floor), MODEL_MOUNTING, Stopwatch())
-        if boxes_points:
+        if "boxes" in needs:
             compile_parts(["boxes"])  # some only several boxes need
-        if options.rules and objects is None and (boxes_points or (top is not None and top.card.box_classes)):
+        if "standing" in needs:
             rules.stand_boxes([UNCERTAIN], *_made_up())
-        if top is not None:
+        if "top_view" in needs:
             compile_kernels()
 
 
@@ -245,7 +241,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "clusters": Part(_compile_clusters, fill_clusters, 3.7),
         "boxes": Part(_compile_boxes, fill_rectangle, 2.7),
         "agreement": Part(_compile_agreement, rules.clear_columns, 2.9),
-        "road": Part(compile_kernels, merge_corners, 2.0),
+        "top_view": Part(compile_kernels, merge_corners, 2.0),
         "ground": Part(_compile_ground, fill_planes, 2.2),
     }
 )
@@ -256,13 +252,13 @@ MAX_HELPERS = 3
 class Helpers:
     """Processes that compile parts of the kernels, for use in a ``with`` statement; at its end none is left.
 
-    parts : collection of str; those of `PARTS` that the caller needs. Those in the cache are left out.
+    needs : those of `PARTS` among them are compiled. Those in the cache are left out.
     """
 
-    def __init__(self, parts: Collection[str]) -> None:
+    def __init__(self, needs: Collection[str]) -> None:
         self._began_s = time.monotonic()
         self.running: list[subprocess.Popen[bytes]] = []
-        parts = [part for part in PARTS if part in parts and is_cold(PARTS[part].largest)]
+        parts = [part for part in PARTS if part in needs and is_cold(PARTS[part].largest)]
         self.own_parts, *self.shares = _shares(parts)
 
     def __enter__(self) -> Helpers:

@@ -179,7 +179,7 @@ def helpers(cold: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[s
 
     def make(code: str) -> Helpers:
         monkeypatch.setattr(warm_up, "START", code)
-        made.append(Helpers(["road"]))
+        made.append(Helpers(["top_view"]))
         return made[-1]
 
     yield make
@@ -263,18 +263,18 @@ def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
 ) -> None:
     monkeypatch.setattr(warm_up, "usable_cores", lambda: 2)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "new" / "cache"))
-    cache = PARTS["road"].largest._cache
-    assert Helpers(["road"]).shares == [["road"]]
+    cache = PARTS["top_view"].largest._cache
+    assert Helpers(["top_view"]).shares == [["top_view"]]
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "file"))
-    assert Helpers(["road"]).shares == []
+    assert Helpers(["top_view"]).shares == []
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     folder = next(cache.folders())
     folder.mkdir(0o755, parents=True)
     file = folder / f"{cache.name}-0123456789abcdef.kernel"
     for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache.stamp(), False)):
         file.write_bytes(content)
-        assert bool(Helpers(["road"]).shares) is is_cold
+        assert bool(Helpers(["top_view"]).shares) is is_cold
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="/proc shows which files a process has open")
@@ -292,7 +292,7 @@ def _help_once() -> None:
     warm_up.is_cold = lambda _: True  # type: ignore[assignment]
     warm_up.usable_cores = lambda: 2
     warm_up.START = "raise SystemExit(0)"
-    with Helpers(["road"]) as running:
+    with Helpers(["top_view"]) as running:
         assert running.running
         running.wait()
 
@@ -314,10 +314,10 @@ warm_up.START = '''
 import sys, time
 sys.path[:] = sys.argv[2:]
 from edgeperc import warm_up
-warm_up.PARTS = {"road": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
+warm_up.PARTS = {"top_view": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
 warm_up.main(sys.argv[1])
 '''
-with warm_up.Helpers(["road"]) as running:
+with warm_up.Helpers(["top_view"]) as running:
     print(running.running[0].pid, flush=True)
     while True:
         time.sleep(0.1)  # a signal that arrives just before a sleep does not end it
@@ -357,8 +357,8 @@ def test_a_helper_ends_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
 import sys, time
 from edgeperc import warm_up
 warm_up.MAX_S = 0.2
-warm_up.PARTS = {"road": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
-warm_up.main("road")
+warm_up.PARTS = {"top_view": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
+warm_up.main("top_view")
 """
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
         try:

@@ -91,7 +91,8 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..zoo import resolve
 
     check_sensor(arguments)
-    arguments.things = [below for thing in arguments.things for below in _below(thing)]
+    folders = {thing: scan_folders(Path(thing)) for thing in filter(_is_scan_folder, arguments.things)}
+    arguments.things = [below for thing in arguments.things for below in map(str, folders.get(thing) or [thing])]
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     if arguments.write is not None:
@@ -113,6 +114,8 @@ def info_command(arguments: argparse.Namespace) -> int:
                 rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
             elif Path(thing).suffix.lower() in IMAGE_SUFFIXES:
                 rows, document = _image_rows(Path(thing))
+            elif folders.get(thing) == []:
+                raise PointsError(nothing_below(Path(thing)))
             else:
                 rows, document = _scan_rows(Path(thing), arguments, sensors, estimators)
                 scans.append(Path(thing))
@@ -200,11 +203,8 @@ def _is_model(thing: str) -> bool:
     return path.suffix == ".onnx" or not is_scan
 
 
-def _below(thing: str) -> list[str]:
-    """The folders of scans of a data set's root; anything else is as it is given."""
-    if _is_model(thing) or not is_folder(Path(thing)):
-        return [thing]
-    return [*map(str, scan_folders(Path(thing)))] or [thing]
+def _is_scan_folder(thing: str) -> bool:
+    return not _is_model(thing) and is_folder(Path(thing))
 
 
 def _folded(rows: Sequence[tuple[str, str]], max_lines: int | None) -> list[tuple[str, str]]:
@@ -366,8 +366,6 @@ def _scan_rows(
     from ..types.frame import ModelFrame
     from ..types.sensor import get_sensor
 
-    if is_folder(path) and not scan_folders(path):
-        raise PointsError(nothing_below(path))
     named, because = sensors.of(path)
     sensor = get_sensor(named)
     scans, damage = _first_scans(path, reading_options(path, arguments))

@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 from ..errors import OptionError
 from ..system.atomic import write_atomic
+from ..system.names import SCAN_SUFFIXES
 from ..system.printable import printable
 
 FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
@@ -179,8 +180,6 @@ def make_places(*files: Path | None) -> None:
     """Make the folders of files that are written at the end, and refuse what cannot be one, a scan that is there, or
     a file of two options: before the work, which may take hours. Raises OptionError.
     """
-    from ..readers.captures import SCAN_SUFFIXES
-
     given = [file for file in files if file is not None]
     for file in given:
         _make(file.parent, str(file))

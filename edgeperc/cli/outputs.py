@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+from ..system.names import SCAN_SUFFIXES, stem_of
 from ..system.remote import Remote
 from .scans import is_recording
 from .sinks import wanted_sinks
@@ -21,7 +22,7 @@ def check_outputs(
     targets: Sequence[Path],
 ) -> None:
     """Check that no file is a scan, or would be one of its folder for the next run, and none is written twice."""
-    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES
+    from ..readers.captures import CAPTURE_SUFFIXES
     from ..readers.images import IMAGE_SUFFIXES
 
     read = [source for source in (*scans, *images.values()) if source is not None]
@@ -50,7 +51,6 @@ def check_outputs(
         outputs += [("--static", arguments.static / name) for name in names]
     if arguments.labels_for is not None:
         from ..sinks.prelabels import calibration_of
-        from ..sinks.run_file import stem_of
 
         _names(arguments, "--labels-for", {scan: stem_of(_shown(scan, captures))[0] for scan in written_of})
         for scan in written_of if arguments.calib is not None else ():

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import MissingExtraError
 from ..system.printable import many
@@ -17,36 +17,33 @@ from .output import in_options, one_line, print_error, print_result
 if TYPE_CHECKING:
     from ..live import Answer
     from ..tracking.tracks import Tracks
-    from ..types.mounting import Mounting
     from ..types.perception import Perception
 
 
+class Outcome(NamedTuple):
+    """Of a scan or image: the answer or an error, and its tracks."""
+
+    source: Path | Remote
+    answer: Perception | Answer | Exception
+    tracks: Tracks | None = None
+
+
 class Report:
-    """Prints the result of each scan, counts scans and failures, and keeps what ``--gif`` draws of every scan."""
+    """Prints the result of each scan, and counts scans and failures."""
 
     def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
         self.n = self.n_failed = 0
         self._images = images
-        self.tracks: list[Tracks] = []
-        self.under: list[tuple[bytes, Mounting]] = []
         self._json = arguments.json
         self._reported: dict[str, Path | Remote] = {}
 
-    def add(
-        self,
-        source: Path | Remote,
-        outcome: Perception | Answer | Exception,
-        tracks: Tracks | None = None,
-        under: tuple[bytes, Mounting] | None = None,
-    ) -> None:
+    def add(self, outcome: Outcome) -> None:
         """Print one scan's line or JSON object; print an error on stderr as well."""
-        if isinstance(outcome, MissingExtraError):
-            raise outcome
-        if tracks is not None and under is not None and not tracks.is_late:
-            self.tracks.append(tracks)
-            self.under.append(under)
-        error = str(outcome).removeprefix(f"{source}: ") if isinstance(outcome, Exception) else None
-        self.show(source, self.text(source, outcome, tracks), error)
+        source, answer, _ = outcome
+        if isinstance(answer, MissingExtraError):
+            raise answer
+        error = str(answer).removeprefix(f"{source}: ") if isinstance(answer, Exception) else None
+        self.show(source, self.text(outcome), error)
 
     def show(self, source: Path | Remote, text: str, error: str | None) -> None:
         """Count a scan, and print its `text` and its error."""
@@ -65,15 +62,14 @@ class Report:
             first = self._reported.setdefault(re.sub(r"[-+\d.]+", "", alike), source)
             print_error(f"{source}: {said}" if first is source else f"{source}: the same as {first}")
 
-    def text(
-        self, source: Path | Remote, outcome: Perception | Answer | Exception, tracks: Tracks | None = None
-    ) -> str:
+    def text(self, outcome: Outcome) -> str:
         """One scan's line or JSON object; of a failed scan without ``--json``, nothing."""
         from ..types.perception import Perception
 
-        if isinstance(outcome, Exception):
-            return json.dumps({**self._names(source), "error": one_line(outcome)}) if self._json else ""
-        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
+        source, found, tracks = outcome
+        if isinstance(found, Exception):
+            return json.dumps({**self._names(source), "error": one_line(found)}) if self._json else ""
+        answer, perception = (None, found) if isinstance(found, Perception) else (found, found.perception)
         timing: dict[str, Any] | None = None
         if answer is not None:
             timing = {"age_ms": round(1e3 * answer.age_s, 3), "health": answer.health}

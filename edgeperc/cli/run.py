@@ -33,9 +33,9 @@ from .arguments import (
     positive,
     positive_number,
 )
-from .output import make_folder, make_places, print_error, print_line, progress
+from .output import make_folder, make_places, print_line, progress
 from .outputs import check_outputs, files_of
-from .report import Report
+from .report import Outcome, Report
 from .scan_times import is_of_kitti, kitti_trajectory, times_of, times_of_set, warn_of_rate
 from .scans import (
     Scans,
@@ -67,11 +67,9 @@ from .sinks import Sinks, add_sinks, wanted_sinks
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..live import Answer
     from ..perceiver import Perceiver
     from ..preprocess.motion import Trajectory
     from ..tracking.tracks import Tracks
-    from ..types.mounting import Mounting
     from ..types.perception import Perception
     from ..types.points import Points
     from ..types.sensor import SensorProfile
@@ -257,10 +255,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     given = [*images] or ([_live_source(arguments)] if arguments.live else [])
     found = Scans(given, [], False) if given else find_scans(arguments.paths)
     scans = found.paths
-    if images and not arguments.scan:
+    of_lidar = [*filter(None, images.values())] if images else scans
+    if of_lidar:
+        check_scans(arguments, of_lidar, images=bool(images))
+    elif images:
         check_inputs(arguments, (), scans[0])
-    elif scans:
-        check_scans(arguments, [*filter(None, images.values())] or scans, images=bool(images))
     check_scan_files(arguments, scans)
     times = {} if arguments.times is None else times_of(arguments.times, scans)
     if arguments.track and not (images or arguments.live or arguments.deskew or times):
@@ -269,8 +268,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     names = output_names([*map(named, scans)], keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     check_outputs(arguments, kinds, images, scans, targets)
-    perceivers = _Perceivers(arguments)
-    perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
+    perceivers = _Perceivers(arguments, of_lidar)
+    perceivers.check(of_images=bool(images))
     written = [*{target.parent for target in targets if kinds}, *[arguments.out] * (arguments.labels_for is not None)]
     for folder in (folder for folder in written if isinstance(folder, Path)):
         make_folder(folder, f"--out {arguments.out}")
@@ -280,7 +279,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     make_places(arguments.mcap, arguments.rrd, arguments.play, arguments.consistency, gif)
     report = Report(arguments, images)
     for folder in found.empty:
-        report.add(folder, PointsError(nothing_below(folder)))
+        report.add(Outcome(folder, PointsError(nothing_below(folder))))
     started = time.perf_counter()
     of_ports, ended = any(map(is_port, scans)), None
     sinks = Sinks(arguments, of_ports=of_ports)
@@ -296,21 +295,11 @@ def run_command(arguments: argparse.Namespace) -> int:
                 else:
                     outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
                 for outcome in outcomes:
-                    report.add(*outcome)
+                    report.add(outcome)
     except (KeyboardInterrupt, SystemExit) as exc:  # how what is live ends: its animation comes, too
         if not (arguments.live or of_ports):
             raise
         ended = exc
-    n_failed = report.n_failed + sinks.n_failed
-    if report.tracks:
-        from ..view.tracks import draw_tracks
-
-        try:
-            under, mountings = zip(*report.under, strict=True)
-            draw_tracks(report.tracks, gif, under=under, mountings=mountings)
-        except (EdgepercError, OSError) as exc:
-            n_failed += 1
-            print_error(f"{gif}: {exc}")
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
@@ -318,7 +307,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
     if ended is not None:
         raise ended
-    return 1 if n_failed else 0
+    return 1 if report.n_failed + sinks.n_failed else 0
 
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
@@ -435,16 +424,14 @@ def _needs_no_camera(scans: Sequence[Path | Remote]) -> str:
 class _Perceivers:
     """A perceiver for each sensor, made when its first scan comes."""
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
-        self._arguments = arguments
-        self._sensors = Sensors(arguments)
+    def __init__(self, arguments: argparse.Namespace, scans: Sequence[Path | Remote] = ()) -> None:
+        self._arguments, self._scans = arguments, scans
+        self._sensors = Sensors(arguments, scans)
         self.of = lru_cache(maxsize=_MOST_PERCEIVERS)(self._make)
 
-    def check(self, scans: Sequence[Path | Remote], of_images: bool) -> None:
+    def check(self, *, of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
-        arguments = self._arguments
-        self._sensors = Sensors(arguments, scans)
-        scans = [scan for scan in scans if isinstance(scan, Path)]
+        arguments, scans = self._arguments, [scan for scan in self._scans if isinstance(scan, Path)]
         for scan in scans:
             try:
                 self.sensor_of(scan)
@@ -476,10 +463,6 @@ class _Perceivers:
         return make_perceiver(arguments, sensor=sensor, on_mismatch=arguments.on_mismatch, adapt=arguments.adapt)
 
 
-Outcome = tuple[Path, "Perception | Answer | Exception", "Tracks | None", "tuple[bytes, Mounting] | None"]
-"""Of a scan or image: name, answer or error, tracks, flattened scan (`edgeperc.view.flatten_scan`) and its mounting."""
-
-
 class _Run:
     """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
@@ -492,21 +475,18 @@ class _Run:
         times: Mapping[Path | Remote, float] = MappingProxyType({}),
     ) -> None:
         from ..tracking.tracker import Tracker
+        from .straighten import Straightener
 
         self._arguments, self._perceivers, self._kinds, self._sinks = arguments, perceivers, kinds, sinks
         self._times = times
         self._tracker = Tracker() if arguments.track else None
-        self._straightener = None
+        self._straightener = Straightener(_trajectory(arguments), deskews=arguments.deskew)
         self._sweeps = self._odometry = None
-        if arguments.deskew or arguments.poses is not None:
-            from .straighten import Straightener
-
-            self._straightener = Straightener(_trajectory(arguments))
         if arguments.sweeps is not None:
             from ..readers.scan_odometry import Odometry
             from ..road.sweeps import Sweeps
 
-            self._sweeps = Sweeps(arguments.sweeps)
+            self._sweeps = None if arguments.live else Sweeps(arguments.sweeps)
             self._odometry = Odometry() if _needs_odometry(arguments) else None
         self._n = 0
         self._folder: Path | Remote | None = None
@@ -527,7 +507,7 @@ class _Run:
             sensor = self._perceivers.sensor_of(path, shown if isinstance(shown, Remote) else None)
             perceive = self._perceivers.of(sensor)
             read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if arguments.deskew else read_scans
-            how = reading_options(path, self._arguments) | {"accumulate_s": _gathered_s(path, sensor)}
+            how = reading_options(path, arguments) | {"accumulate_s": _gathered_s(path, sensor)}
             if how["accumulate_s"] is not None and not arguments.deskew:
                 warnings.warn(
                     f"{shown}: the points of the last {how['accumulate_s']:g} s are taken as seen from one place; "
@@ -542,25 +522,22 @@ class _Run:
                 stamp_s = self._times.get(shown, stamp_s)
                 at_s = self._at_s(stamp_s)
                 try:
-                    if arguments.deskew and self._straightener is not None:
-                        points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
-                    elif self._straightener is not None:
-                        self._straightener.place(stamp_s)
+                    points = self._straightener.straighten(stamp_s, points, *times_s, sensor=perceive.sensor)
                     pose, earlier = self._pose(points, at_s, how["origin_m"]), None
                     if self._sweeps is not None:
                         earlier = self._sweeps.earlier(points, at_s, pose)
                     perception = perceive(points, stamp_s, origin_m=how["origin_m"], earlier=earlier)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)
-                    wanted = files_of(self._arguments, file, self._kinds, False)
+                    wanted = files_of(arguments, file, self._kinds, False)
                     yield self._answered(name, points, perception, perceive.sensor, wanted, at_s, pose)
                 except (EdgepercError, OSError) as exc:
-                    yield name, exc, None, None
+                    yield Outcome(name, exc)
                 except MemoryError:
-                    yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
+                    yield Outcome(name, PointsError(f"{len(points):,} points take more memory than there is"))
         except (EdgepercError, OSError) as exc:
             self._n += not numbered  # a scan that cannot be read takes its time, too
-            yield shown, exc, None, None
+            yield Outcome(shown, exc)
 
     def _enter(self, folder: Path | Remote) -> None:
         """Tell drives apart: in files without times, the next folder's scans would continue the tracks of the last. A
@@ -607,7 +584,7 @@ class _Run:
             if "image" in wanted:
                 view.draw_image(perception, image, wanted.pop("image"), title=path.name)
             if points is None:
-                yield path, perception, None, None
+                yield Outcome(path, perception)
                 return
             if "both" in wanted:
                 calib = calibration_of(arguments.calib, str(scan))
@@ -616,9 +593,9 @@ class _Run:
             pose = self._pose(points, at_s, origin)
             yield self._answered(path, points, perception, perceive.sensor, wanted, at_s, pose, scan)
         except (EdgepercError, OSError) as exc:
-            yield path, exc, None, None
+            yield Outcome(path, exc)
         except MemoryError:
-            yield path, ImageError("the image takes more memory than there is"), None, None
+            yield Outcome(path, ImageError("the image takes more memory than there is"))
 
     def live(self, path: Path) -> Iterator[Outcome]:
         """Perceive the newest scan, as a stream delivers them."""
@@ -643,7 +620,7 @@ class _Run:
                 except StopIteration:
                     return
                 except (EdgepercError, OSError) as exc:
-                    yield path, exc, None, None  # newer scans may have arrived, so the failed scan's number is unknown
+                    yield Outcome(path, exc)  # newer scans may have arrived, so the failed scan's number is unknown
                     continue
                 assert answer is not None
                 name, of_scan = name_of(answer.n_scans - 1), (answer.points, answer.perception, answer.tracks)
@@ -652,7 +629,7 @@ class _Run:
                     self._sinks.write(scan)
                 except (EdgepercError, OSError) as exc:  # a full disk costs nobody who listens the answer
                     self._sinks.failed(f"{name}: ", exc)
-                yield name, answer, answer.tracks, None
+                yield Outcome(name, answer, answer.tracks)
 
     def _answered(
         self,
@@ -672,7 +649,7 @@ class _Run:
         tracks = None
         if self._tracker is not None and not (self._odometry is not None and pose is None):
             tracks = self._tracker.update(perception.boxes, stamp_s, pose, mounting=perception.mounting)
-        if self._straightener is not None and tracks is not None:
+        if tracks is not None:
             self._straightener.follow(tracks)
         if self._sweeps is not None and tracks is not None:
             self._sweeps.add(points, perception, tracks)
@@ -687,14 +664,13 @@ class _Run:
                 view.write_ply(perception, points, wanted["ply"])
         finally:  # a picture that cannot be written costs no sink its scan
             self._sinks.write(PerceivedScan(source, stamp_s, points, perception, tracks, sensor))
-        under = (view.flatten_scan(points, perception), perception.mounting) if self._arguments.gif else None
-        return name, perception, tracks, under
+        return Outcome(name, perception, tracks)
 
     def _pose(self, points: Points, stamp_s: float, origin_m: Sequence[float] | None) -> ArrayLike | None:
         """Pose of the sensor, seen from that of the first scan: by ``--poses``, where its place in a map is known,
         whose axes are then its own, or for ``--sweeps`` by an odometry.
         """
-        if self._straightener is not None and self._straightener.pose is not None:
+        if self._straightener.pose is not None:
             return self._straightener.pose
         if origin_m is None:
             return None if self._odometry is None else self._odometry(points, stamp_s)

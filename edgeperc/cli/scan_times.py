@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EdgepercError, StampError, TrackingError
+from ..system.names import stem_of
 from ..system.printable import many
 from ..system.remote import Remote
 from .output import print_line
@@ -29,7 +30,6 @@ def times_of(file: Path, scans: Sequence[Path | Remote]) -> dict[Path | Remote, 
     """The times of scan files of one drive, by the lines of a file: a line for each, or for each number in their names,
     from 0 on, as KITTI's. Raises StampError, OSError.
     """
-    from ..sinks.run_file import stem_of
 
     times_s = _read_times(file)
     if len({scan.parent for scan in scans}) > 1 or any(map(is_recording, scans)):
@@ -180,8 +180,6 @@ def _other_rate(times_s: Sequence[float] | Floats, rate_hz: float, by: str) -> s
 def _contradiction(names: Sequence[str], rate_hz: float) -> str:
     """How names contradict that scans follow one another at a rate, and what to do; empty if they do not."""
     import numpy as np
-
-    from ..sinks.run_file import stem_of
 
     ends = [re.search(r"\d+(\.\d+)?$", stem_of(name)[0]) for name in names]
     words = [end[0] for end in ends if end is not None]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import EdgepercError, ImageError, SensorError
-from ..system.names import by_number
+from ..system.names import SCAN_SUFFIXES, by_number, stem_of
 from ..system.printable import many
 from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR, DEFAULT_SENSOR
@@ -83,7 +83,7 @@ def nothing_below(folder: Path | Remote) -> str:
 
 def find_scans(paths: Sequence[Path]) -> Scans:
     """Scan files and captures in the order of ``paths``; those of a folder, data set or URL's folders are sorted."""
-    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, scan_files
+    from ..readers.captures import CAPTURE_SUFFIXES, scan_files
 
     scans: dict[str, Path] = {}
     empty, of_data_set = [], False
@@ -166,7 +166,6 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
 
 def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Sequence[Path | Remote]) -> None:
     """Check that there are as many scans as images, and that no image gets the scan of another one."""
-    from ..sinks.run_file import stem_of
 
     if len(scans) != len(images):
         counts = f"{many(len(scans), 'scan')} for {many(len(images), 'image')}"
@@ -187,8 +186,6 @@ def check_pairs(arguments: argparse.Namespace, images: Sequence[Path], scans: Se
 def _warn_of_times(pairs: Sequence[tuple[Path, Path | Remote]]) -> None:
     """Warn of an image whose scan is another one's by the times in their names; clocks may differ, so no error."""
     import numpy as np
-
-    from ..sinks.run_file import stem_of
 
     stems = [[stem_of(file.name)[0] for file in pair] for pair in pairs]
     if not all(TIME_IN_NAME.fullmatch(stem) for pair in stems for stem in pair):

@@ -31,7 +31,7 @@ from ..system.remote import Remote
 from ..types.choices import AUTO_SENSOR
 from .arguments import options, positive
 from .output import one_line, print_line
-from .report import Report
+from .report import Outcome, Report
 from .scans import is_recording
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ _OTHERS = ("engine", "live", "out", "paths", "rate", "threads", "typed", "worker
 # What the parser adds to the arguments; it cannot be pickled.
 _OF_PARSER = ("command", "parser", "usage_error")
 
-Outcome = tuple[Any, Any, Any, Any]  # `edgeperc.cli.run.Outcome`
 Scan = Callable[..., Iterator[Outcome]]
 _Pair = tuple[Path | Remote, Path | Remote]
 _Show = Callable[[int, int], None]
@@ -136,7 +135,7 @@ def perceive_side_by_side(
     for sensor, of_sensor in groupby(zip(scans, targets, strict=True), sensor_of):
         pairs = [*of_sensor]
         if isinstance(sensor, Exception):
-            report.add(pairs[0][0], sensor)
+            report.add(Outcome(pairs[0][0], sensor))
         else:
             given = argparse.Namespace(**{**vars(arguments), "sensor": sensor})
             shown = partial(lambda before, n, _: show(before + n, len(scans)), done)
@@ -152,7 +151,7 @@ def _perceive_one_sensor(
     n_first = 0
     while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:
         for outcome in run(scans[n_first], targets[n_first]):
-            report.add(*outcome)
+            report.add(outcome)
         n_first += 1
         show(n_first, len(scans))
     if n_first == len(scans):
@@ -179,7 +178,7 @@ def _perceive_one_sensor(
     n_kept = 0
     for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
         if isinstance(answer, Lost):
-            answer = _Answer(report.text(scan, EdgepercError(answer.reason)), one_line(answer.reason), (), ())
+            answer = _Answer(report.text(Outcome(scan, EdgepercError(answer.reason))), one_line(answer.reason), (), ())
         for message in answer.warnings:
             warnings.warn(message, stacklevel=2)
         report.show(scan, _said_once(answer, reported) if learned.is_settled else answer.text, answer.error)
@@ -236,14 +235,14 @@ class ScanWorker:
             outcomes = list(self._run(path, target, name))
         if len(outcomes) != 1:
             raise EdgepercError(f"{name} holds {many(len(outcomes), 'scan')}; worker processes take files of one")
-        ((_, outcome, _, _),) = outcomes
-        if isinstance(outcome, EdgepercError):  # it names the absolute path
-            outcome.args = (str(outcome).replace(str(path), str(name)),)
-        text = self._report.text(name, outcome)
+        found: Any = outcomes[0].answer
+        if isinstance(found, EdgepercError):  # it names the absolute path
+            found.args = (str(found).replace(str(path), str(name)),)
+        text = self._report.text(Outcome(name, found))
         warned = tuple(dict.fromkeys(str(warning.message) for warning in caught))
-        if isinstance(outcome, Exception):
-            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
-        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)
+        if isinstance(found, Exception):
+            return _Answer(text, str(found).removeprefix(f"{name}: "), (), warned)
+        answer = _Answer(text, None, tuple(map(str, found.fitness)), warned)
         if files:
             written = {"made_of": made_of, "files": _stamps(files), "answer": astuple(answer)}
             content = json.dumps(written).encode()
@@ -301,17 +300,17 @@ def through_temporary(run: Scan, path: Path | Remote, target: Path | Remote) -> 
         try:
             local = path.fetch(Path(folder)) if isinstance(path, Remote) else path
         except (EdgepercError, OSError) as exc:
-            yield path, exc, None, None
+            yield Outcome(path, exc)
             return
         aside = written / target.name if isinstance(target, Remote) else target
-        for name, outcome, tracks, under in run(local, aside, path):
+        for outcome in run(local, aside, path):
             try:
                 for file in sorted(each for each in written.rglob("*") if each.is_file()):
                     assert isinstance(target, Remote)
                     (target.parent / file.relative_to(written)).write_bytes(file.read_bytes())
                     file.unlink()
             except (EdgepercError, OSError) as exc:
-                outcome, tracks, under = exc, None, None
-            if isinstance(outcome, EdgepercError):  # it names the temporary file
-                outcome.args = (str(outcome).replace(str(local), str(path)),)
-            yield name, outcome, tracks, under
+                outcome = Outcome(outcome.source, exc)
+            if isinstance(outcome.answer, EdgepercError):  # it names the temporary file
+                outcome.answer.args = (str(outcome.answer).replace(str(local), str(path)),)
+            yield outcome

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
-from ..errors import EdgepercError
+from ..errors import EdgepercError, TrackingError
 from ..records import PerceivedScan, Sink
 from .arguments import options
 from .output import print_error, print_line
@@ -83,6 +84,33 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
     return [name for name in SINKS if getattr(arguments, name) is not None]
 
 
+class GifSink:
+    """Collects the tracks of a run, and draws them above its scans when it is over, for ``--gif``."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._scans = path, list[tuple[Any, ...]]()  # tracks, flattened scan, mounting
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Take in a scan that has tracks."""
+        from ..types.points import as_points
+        from ..view.tracks import flatten_scan
+
+        if scan.tracked is not None:
+            flat = flatten_scan(as_points(scan.points), scan.perception)
+            self._scans.append((scan.tracked, flat, scan.perception.mounting))
+
+    def close(self, whole: bool = True) -> None:
+        """Draw the tracks, if the run is whole and there are some. Raises EdgepercError, OSError."""
+        from ..view.tracks import draw_tracks
+
+        if whole and self._scans:
+            tracks, under, mountings = zip(*self._scans, strict=True)
+            try:
+                draw_tracks(tracks, self._path, under=under, mountings=mountings)
+            except TrackingError as exc:
+                raise TrackingError(f"{self._path}: {exc}") from exc
+
+
 class Sinks:
     """The sinks of the passed options, made before the first scan: each gets every scan and is closed, whatever becomes
     of the others. ``n_failed`` counts what could not be written: a live answer, or the end of a file.
@@ -121,6 +149,8 @@ class Sinks:
             raise errors[0]
 
     def _open(self, arguments: argparse.Namespace) -> None:
+        if arguments.gif:
+            self._add(GifSink(arguments.out / "tracks.gif"))
         if not wanted_sinks(arguments):
             return
         from ..sinks.foxglove import McapSink, ServeSink

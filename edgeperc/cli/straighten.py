@@ -1,4 +1,6 @@
-"""Scans of ``edgeperc run --deskew``: their points moved to where a standing sensor would have seen them."""
+"""Scans of ``edgeperc run``: their poses by ``--poses``, and with ``--deskew`` their points moved to where a standing
+sensor would have seen them.
+"""
 
 from __future__ import annotations
 
@@ -11,26 +13,36 @@ from ..preprocess.motion import Motion, Trajectory, deskew
 from ..preprocess.returns import returns
 from ..readers.times import middle_after
 from ..tracking.tracks import Tracks
-from ..types.points import Floats, Floats32, Points
+from ..types.points import Floats, Floats32
 from ..types.sensor import SensorProfile
 
 
 class Straightener:
-    """Straightens scans by the poses of the sensor, or by the motion between tracked scans. Raises TrackingError."""
+    """Straightens scans, if it ``deskews``, by the poses of the sensor or the motion between tracked scans; places them
+    otherwise. Raises TrackingError.
+    """
 
-    def __init__(self, trajectory: Trajectory | None) -> None:
-        self._trajectory = trajectory
+    def __init__(self, trajectory: Trajectory | None, *, deskews: bool) -> None:
+        self._trajectory, self._deskews = trajectory, deskews
         self._begin: Floats | None = None  # pose of the first scan
         self.pose: Floats | None = None  # that of the last scan, seen from the first one; None without a trajectory
         self._middle_s = -np.inf  # of the times of the last scan
         self._tracked: list[Tracks] = []
 
     def straighten(
-        self, stamp_s: float | None, points: Points, times_s: Floats | None, sensor: SensorProfile | None = None
+        self,
+        stamp_s: float | None,
+        points: Floats32,
+        times_s: Floats | None = None,
+        *,
+        sensor: SensorProfile | None = None,
     ) -> Floats32:
         """Points in the sensor's frame at the scan's stamp, or at its last point if the stamp is on another clock; what
         the sensor drops stays where it is: the own vehicle moves with it. Without poses, the first two scans stay.
         """
+        if not self._deskews:
+            self.place(stamp_s)
+            return points
         if times_s is None:
             raise PointsError(
                 "the scan has no times of points: no field t, time or timestamp, or its values do not span the 2 ms to "

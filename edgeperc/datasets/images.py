@@ -17,7 +17,6 @@ from ..types.points import Bytes
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 UNLABELED = ("unlabeled", "unlabelled", "void")  # both spellings are in data sets
 IGNORE = 255
-LEVEL = 0.95
 
 
 class LabeledImages:

@@ -13,9 +13,9 @@ import numpy as np
 
 from ..errors import PointsError
 from ..readers.files import read_points
+from ..system.names import SCAN_SUFFIXES
 from ..types.perception import Box
 from .kitti import TRACKING_DRIVES, KittiCalibration, KittiLabels, label_lines, label_objects, labels_of, read_labels
-from .layout import SUFFIXES
 from .tree import Camera, Labeled, Tree, present
 
 
@@ -103,7 +103,7 @@ class KittiRaw(Tree):
 def _scans_of(drive: Path) -> dict[int, Path]:
     """The scans of a drive by frame: by their numbers, or as ``frame_list.txt`` tells, which CVAT writes."""
     folder, table = drive / "velodyne_points" / "data", drive / "frame_list.txt"
-    paths = sorted(path for path in folder.glob("[!.]*") if path.name.lower().endswith(SUFFIXES))
+    paths = sorted(path for path in folder.glob("[!.]*") if path.name.lower().endswith(SCAN_SUFFIXES))
     if not table.is_file():
         numbered = {path.name.partition(".")[0]: path for path in paths}
         if odd := [path for name, path in numbered.items() if not name.isdecimal()]:

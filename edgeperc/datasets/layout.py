@@ -36,7 +36,6 @@ SCHEMA = 1
 LAYOUTS = Path(__file__).with_name("layouts")
 BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
 WITH_RIDER = ".with_rider"  # after the class of a box, by its attribute in nuScenes' tables
-SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 _SENSOR_KEYS = {"like", "name", "elevations_deg", "columns", "remission_range", "min_range_m", "max_range_m"}
 _CLASS_NAME = re.compile(r"[a-z][a-z0-9 _-]{0,30}")
 _FIELDS = Fields("the description", PointsError, "write what docs/howto/sensor.md lists", optional=("*",), exact=True)

@@ -35,6 +35,7 @@ from ..errors import PointsError
 from ..readers.files import read_points
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
+from ..system.names import SCAN_SUFFIXES, stem_of
 from ..types.choices import VEHICLES
 from ..types.geometry import inside
 from ..types.perception import ROADS, Box
@@ -47,7 +48,6 @@ from .layout import (
     BOX_COLUMNS,
     BOX_FILES,
     IGNORED,
-    SUFFIXES,
     ScanLayout,
     class_number,
     class_of_name,
@@ -302,11 +302,10 @@ class ScanFolder:
         scans: dict[str, Path] = {}
         nested = self.layout.files == "semantickitti"
         for path in sorted(self.root.glob("sequences/[!.]*/velodyne/[!.]*" if nested else "velodyne/[!.]*")):
-            suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
-            if suffix is None:
-                raise PointsError(f"{path}: no scan by its name; expected {', '.join(SUFFIXES)} in velodyne/")
-            name = path.name[: -len(suffix)]
-            name = f"{path.parts[-3]}/{name}" if nested else name
+            stem, suffix = stem_of(path.name)
+            if not suffix:
+                raise PointsError(f"{path}: no scan by its name; expected {', '.join(SCAN_SUFFIXES)} in velodyne/")
+            name = f"{path.parts[-3]}/{stem}" if nested else stem
             if name in scans:
                 raise PointsError(f"{path} and {scans[name].name} have one name; give each scan a name of its own")
             scans[name] = path

@@ -7,20 +7,20 @@ over drives would be wider; CamVid's validation images are of a single drive.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..datasets.images import FOLDERS, LEVEL, LabeledImages, image_hash
+from ..datasets.images import FOLDERS, LabeledImages, image_hash
 from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
 from ..types.card import ModelCard
 from ..types.points import Bytes, Floats, Ints64
 from .judge import training_scans_of
 from .metrics import Confusion, mean
+from .tables import interval, plain
 from .truth import check_different
 
 
@@ -109,11 +109,6 @@ def _rates(classes: Sequence[str], counts: Ints64) -> tuple[dict[str, float], di
 
 def _with_intervals(rates: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     """The first rates, each with the interval of the others."""
-    row: dict[str, Any] = {}
-    for key, value in rates[0].items():
-        samples = np.array([each[key] for each in rates[1:]])
-        known, bounds = samples[~np.isnan(samples)], None
-        if known.size:
-            bounds = [round(float(v), 4) for v in np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])]
-        row |= {key: None if math.isnan(value) else round(float(value), 4), f"{key}_interval": bounds}
+    intervals = {f"{key}_interval": interval(np.array([each[key] for each in rates[1:]])) for key in rates[0]}
+    row: dict[str, Any] = plain({key: float(value) for key, value in rates[0].items()} | intervals)
     return row

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..simulation.samples import IGNORE
 from ..types.choices import STATIC, VEHICLES
-from ..types.points import Bytes, Labels
+from ..types.points import Bytes, Floats, Labels
 from .causes import BUMPER, CAUSES, FLOOR
 from .center_ap import CLASSES, center_scores
 from .kitti_ap import average_precisions
@@ -106,7 +106,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     different, times = np.unique(np.sort(draws, axis=1), axis=0, return_counts=True)
     samples = [_figures(_summed([drives[k] for k in draw])) for draw in different]
     _add_intervals(whole, [_figures(drive) for drive in drives], samples, times)
-    return _plain(whole) | {"n_frames": sum(map(len, by_drive.values())), "n_drives": len(drives)}
+    return plain(whole) | {"n_frames": sum(map(len, by_drive.values())), "n_drives": len(drives)}
 
 
 def _one_drive(scans: Sequence[Tallies]) -> Tallies:
@@ -359,15 +359,19 @@ def _interval(counts: Sequence[int], values: Sequence[float], times: NDArray[Any
     """2.5 and 97.5 % quantiles of the resampled values; None with data from fewer than two drives."""
     if sum(n > 0 for n in counts) < 2:
         return None
-    every = np.repeat(np.asarray(values, np.float64), times)
-    every = every[~np.isnan(every)]
-    return [float(v) for v in np.percentile(every, [2.5, 97.5])] if every.size else None
+    return interval(np.repeat(np.asarray(values, np.float64), times))
 
 
-def _plain(value: Any) -> Any:
+def interval(values: Floats) -> list[float] | None:
+    """2.5 and 97.5 % quantiles of the values that are not NaN; None if there are none."""
+    known = values[~np.isnan(values)]
+    return [float(v) for v in np.percentile(known, [2.5, 97.5])] if known.size else None
+
+
+def plain(value: Any) -> Any:
     """Prepare for JSON: four decimals, None for NaN."""
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     return (None if math.isnan(value) else round(value, 4)) if isinstance(value, float) else value

@@ -28,10 +28,10 @@ from ..errors import (
     EdgepercError,
     InferenceError,
     ModelFileError,
-    OptionError,
     ProviderError,
     SettingsError,
 )
+from ..system.fields import OPTIONS
 from ..system.interpreter import kept_in_forks, native_call
 from ..system.machine import (
     MAX_THREADS,
@@ -124,8 +124,8 @@ class Session:
         at_once: int = 1,
         trusted: bool = False,
     ) -> None:
-        if n_threads is not None and not 1 <= n_threads <= MAX_THREADS:
-            raise OptionError(f"n_threads is {n_threads!r:.20}; expected 1 to {MAX_THREADS}, or None")
+        if n_threads is not None:
+            n_threads = OPTIONS.whole("n_threads", n_threads, 1, MAX_THREADS)
         check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once if n_threads is None else 1
         self._made_in, self._running_in = os.getpid(), 0

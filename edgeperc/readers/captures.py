@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from ..errors import PointsError, SensorError
-from ..system.names import by_number
+from ..system.names import SCAN_SUFFIXES, by_number
 from ..types.points import Floats32
 from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
@@ -22,7 +22,6 @@ from .ports import is_port, release
 from .times import TimedScan, accumulate
 from .unknown import advice_for, missing
 
-SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".lvx2", ".mcap", ".osf", ".pcap", ".pcapng")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,7 @@ from .times import TimedScan
 from .units import hesai_calibration
 
 _STEPS = 200  # packets that show how far apart columns are
-Opened = tuple[SpinningStream | MemsStream | MirrorStream, Callable[[memoryview], bool]]
+Stream = SpinningStream | MemsStream | MirrorStream
 
 
 def open_spinning(
@@ -118,7 +117,7 @@ def _file_of(path: Path, suffix: str, whose: Whose) -> Path | None:
 def columns_of(row: Format, payloads: Iterable[memoryview]) -> int:
     """How many columns a turn has, by the azimuths of the first packets; 0 if they do not show it."""
     stream, azimuths = SpinningStream(row, Angles(np.zeros((128, 2)))), list[float]()
-    for payload in islice((each for each in payloads if is_of(row, each)), _STEPS):
+    for payload in islice(filter(row.fits, payloads), _STEPS):
         azimuths += stream.azimuths_of(payload)
     steps = np.diff(azimuths) % 360.0
     steps = steps[(steps > 0.01) & (steps < 5.0)]
@@ -134,7 +133,7 @@ def payloads_of(
     return (datagram.payload for datagram in datagrams if datagram.is_from(sender))
 
 
-def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview], whose: Whose = ALONE) -> Opened | None:
+def stream_of(path: Path, payload: memoryview, units: Iterable[memoryview], whose: Whose = ALONE) -> Stream | None:
     """`open_stream` of a sensor that sends such packets; None if it has no points.
 
     Raises PointsError: The packets of the sensor are not decoded, or `open_spinning`.
@@ -153,29 +152,19 @@ def _known_format(payload: memoryview) -> Format | MemsFormat | None:
 
 def open_stream(
     path: Path, row: Format | MemsFormat, units: Iterable[memoryview], whose: Whose = ALONE, unit: str | None = None
-) -> Opened:
-    """What makes scans of the packets of a format, and tells them from others; PointsError as of `open_spinning`."""
+) -> Stream:
+    """What makes scans of the packets of a format; PointsError as of `open_spinning`."""
     if isinstance(row, MemsFormat):
-        return MemsStream(row), lambda payload: mems_format_of(payload) is row
-    if not row.spins:
-        file = _file_of(path, ".dat", whose)
-        if file is None and unit is not None:
-            with _asked(f"where the lasers of this {row.title} look is not known", f"{_stem(path, whose)}.dat"):
-                return MirrorStream(row, read_mirrors(hesai_calibration(unit))), partial(is_of, row)
-        if file is None:
-            raise PointsError(
-                f"where the lasers of this {row.title} look is not known. Put the correction file of the unit beside "
-                f"it, as {_stem(path, whose)}.dat"
-            )
-        return MirrorStream(row, read_mirrors(file)), partial(is_of, row)
-    found, angles = open_spinning(path, row, units, whose, unit)
-    return SpinningStream(found, angles), partial(is_of, found)
-
-
-def is_of(row: Format, payload: memoryview) -> bool:
-    """Whether it is a packet of this format."""
-    found = format_of(payload)
-    return found is not None and (found == row or row.name == ALIKE.get(found.name))
+        return MemsStream(row)
+    if row.spins:
+        return SpinningStream(*open_spinning(path, row, units, whose, unit))
+    file, unknown = _file_of(path, ".dat", whose), f"where the lasers of this {row.title} look is not known"
+    if file is None and unit is not None:
+        with _asked(unknown, f"{_stem(path, whose)}.dat"):
+            return MirrorStream(row, read_mirrors(hesai_calibration(unit)))
+    if file is None:
+        raise PointsError(f"{unknown}. Put the correction file of the unit beside it, as {_stem(path, whose)}.dat")
+    return MirrorStream(row, read_mirrors(file))
 
 
 def describe_packets(
@@ -199,16 +188,15 @@ def turns_of(path: Path, lidar: Lidar, sender: str | None, alive: Callable[[], N
     Raises PointsError: As `open_spinning`.
     """
     first = sender or lidar.first
-    if lidar.row is not None:
-        payloads, unit = payloads_of(path, sender, alive), unit_at(path, first)
-        stream, is_of_sensor = open_stream(path, lidar.row, payloads, lidar.whose(sender), unit)
-        for payload in payloads_of(path, first, alive, endless=True):
-            if is_of_sensor(payload):
-                yield from stream.add(payload)
-        yield from stream.end()
-    else:
+    payloads = payloads_of(path, first, alive, endless=True)
+    if lidar.row is None:
         livox = LivoxStream()
-        for payload in payloads_of(path, first, alive, endless=True):
-            if (points := points_of(payload)) is not None:
-                yield from livox.add(points)
+        for points in filter(None, map(points_of, payloads)):
+            yield from livox.add(points)
         yield from livox.end()
+        return
+    units, unit = payloads_of(path, sender, alive), unit_at(path, first)
+    stream = open_stream(path, lidar.row, units, lidar.whose(sender), unit)
+    for payload in filter(stream.row.fits, payloads):
+        yield from stream.add(payload)
+    yield from stream.end()

@@ -33,6 +33,10 @@ class MemsFormat(NamedTuple):
     ahead: Callable[[NDArray[Any]], Floats]  # of points: their directions, (..., 3)
     spins: bool = False  # as of `spinning_packets.Format`
 
+    def fits(self, payload: memoryview) -> bool:
+        """Whether it is a packet of this format."""
+        return mems_format_of(payload) is self
+
 
 def _packet(size: int, block: list[Any], n_blocks: int) -> np.dtype[Any]:
     names = ["number", "high", "low", "micros", "blocks"]
@@ -69,7 +73,7 @@ class MemsStream:
     """Frames from packets of one format."""
 
     def __init__(self, row: MemsFormat) -> None:
-        self._row, self._packets, self._last, self._newest = row, list[bytes](), -1, Newest()
+        self.row, self._packets, self._last, self._newest = row, list[bytes](), -1, Newest()
 
     def add(self, payload: memoryview) -> Iterator[TimedScan]:
         """The frame that ends before a packet: where packets are counted anew. A late one is of that it comes in."""
@@ -84,7 +88,7 @@ class MemsStream:
 
     def end(self) -> Iterator[TimedScan]:
         """The last frame, which may be a part."""
-        packets, self._packets, self._last = np.frombuffer(b"".join(self._packets), self._row.packet), [], -1
+        packets, self._packets, self._last = np.frombuffer(b"".join(self._packets), self.row.packet), [], -1
         if not len(packets):
             return
         points = packets["blocks"]["points"]
@@ -93,6 +97,6 @@ class MemsStream:
         shown = points["distance"] > 0
         kept = points[shown]
         scan = np.empty((len(kept), 4), np.float32)
-        scan[:, :3] = _UNIT_M * kept["distance"].astype(np.float64)[:, None] * self._row.ahead(kept)
+        scan[:, :3] = _UNIT_M * kept["distance"].astype(np.float64)[:, None] * self.row.ahead(kept)
         scan[:, 3] = kept["reflectivity"]
         yield TimedScan(float(times_s.max()), scan, np.broadcast_to(times_s[..., None], shown.shape)[shown])

@@ -80,7 +80,7 @@ class MirrorStream:
     """Frames from the packets of an AT128."""
 
     def __init__(self, row: Format, mirrors: Mirrors) -> None:
-        self._row, self._mirrors = row, mirrors
+        self.row, self._mirrors = row, mirrors
         self._off = np.moveaxis(mirrors.off, 2, 0).copy()
         self._packets, self._mirror, self._size, self._newest = list[_Packet](), -1, 0, Newest()
 
@@ -91,10 +91,10 @@ class MirrorStream:
         self._size = self._size or len(payload)
         if len(payload) != self._size:
             return
-        row, mirrors = self._row, self._mirrors
+        row, mirrors = self.row, self._mirrors
         angles = (_MOTOR.unpack_from(payload, at) for at in row.blocks_at)
         motor = [256 * hundredths + fine for hundredths, fine in angles]
-        seen, time_s = [mirrors.at(angle) for angle in motor], time_of(row, payload)
+        seen, time_s = [mirrors.at(angle) for angle in motor], time_of(row.clock, payload)
         is_late = self._newest.has_overtaken(time_s)
         for mirror in dict.fromkeys(seen):
             if mirror < 0 or (is_late and mirror != self._mirror):
@@ -109,7 +109,7 @@ class MirrorStream:
         packets, self._packets = self._packets, []
         if not packets:
             return
-        row = self._row
+        row = self.row
         content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
         blocks = content[:, row.header : row.blocks_at.stop].reshape(-1, row.block_bytes)
         returns = blocks[:, row.first :].reshape(len(packets), row.n_blocks, _N_LASERS, row.channel_bytes)

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import PointsError
+from ..system.fields import Fields
 from .ports import is_port, listen, named
 from .units import Told, ouster_metadata
 
+FIELDS = Fields("the metadata", PointsError)
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
 _MOST_JSON_BYTES = 1 << 24
@@ -100,14 +102,13 @@ def check_metadata(content: Any) -> None:
         raise PointsError("data_format: expected an object")
     most = {"columns_per_packet": 1024, "pixels_per_column": _MOST_BEAMS, "columns_per_frame": _MOST_COLUMNS}
     for name, limit in most.items():
-        if name in layout and not (_is_whole(layout[name]) and 1 <= layout[name] <= limit):
-            raise PointsError(f"{name}: expected a whole number from 1 to {limit}, got {layout[name]!r}")
+        if name in layout:
+            FIELDS.whole(name, layout[name], 1, limit)
     columns, beams = layout.get("columns_per_frame", _MOST_COLUMNS), layout.get("pixels_per_column")
     if layout.get("columns_per_packet", 1) > columns:
         raise PointsError(f"columns_per_packet: {layout['columns_per_packet']} is above columns_per_frame, {columns}")
-    window = layout.get("column_window", [0, 0])
-    if not (isinstance(window, list) and len(window) == 2 and all(_is_whole(v) and 0 <= v < columns for v in window)):
-        raise PointsError(f"column_window: expected two columns from 0 to {columns - 1}, got {window!r:.80}")
+    for edge in FIELDS.entry(tuple[int, int], layout.get("column_window", [0, 0]), "column_window"):
+        FIELDS.whole("column_window", edge, 0, columns - 1)
     angles = content.get("beam_intrinsics", {})
     for holder in (content, angles if isinstance(angles, dict) else {}):
         for name in ("beam_altitude_angles", "beam_azimuth_angles"):
@@ -116,12 +117,8 @@ def check_metadata(content: Any) -> None:
     shifts = layout.get("pixel_shift_by_row")
     if shifts is not None:
         _checked_beams("pixel_shift_by_row", shifts, beams)
-        if any(not _is_whole(shift) or abs(shift) > columns for shift in shifts):
-            raise PointsError(f"pixel_shift_by_row: expected whole numbers up to {columns}")
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+        for shift in shifts:
+            FIELDS.whole("pixel_shift_by_row", shift, -columns, columns)
 
 
 def _checked_beams(name: str, values: Any, n: int | None) -> int:
@@ -132,9 +129,7 @@ def _checked_beams(name: str, values: Any, n: int | None) -> int:
             f"{name}: expected a list of {n or f'1 to {_MOST_BEAMS}'} numbers, one for each beam, got {got}"
         )
     for value in values:  # early firmware has a list of numbers for each beam
-        numbers = value if isinstance(value, list) else [value]
-        if not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _MOST_COLUMNS for v in numbers):
-            raise PointsError(f"{name}: expected numbers up to {_MOST_COLUMNS}, got {value!r:.80}")
+        FIELDS.numbers(name, value if isinstance(value, list) else [value], low=-_MOST_COLUMNS, high=_MOST_COLUMNS)
     return len(values)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..system.kernels import njit
 from ..types.points import Bytes, Floats, Ints64
-from .ouster import check_metadata, object_in
+from .ouster import FIELDS, check_metadata, object_in
 from .times import TimedScan
 
 
@@ -149,30 +149,19 @@ def layout_of(content: Any) -> Layout:
 
 def _number(content: Mapping[str, Any], name: str, default: float) -> float:
     value = content.get(name)
-    if value is None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise PointsError(f"{name}: expected a number, got {value!r:.60}")
-    return value
+    return default if value is None else FIELDS.number(name, value, -1e9, 1e9)
 
 
 def _angles(content: Mapping[str, Any], name: str) -> Floats:
-    values = content.get(name)
-    if not isinstance(values, list) or any(isinstance(value, list) for value in values):
-        raise PointsError(f"{name}: expected a list of numbers, one for each beam")
+    values = FIELDS.numbers(name, content.get(name))
     if name == "beam_altitude_angles" and len({*values}) < len(values):
         raise PointsError(f"{name}: several beams have the same angle")
-    return np.radians(np.array(values, np.float64))
+    return np.radians(np.array(values))
 
 
 def _transform(content: Mapping[str, Any], name: str, default: Floats) -> Floats:
     values = content.get(name)
-    if values is None:
-        return default
-    flat = values if isinstance(values, list) else []
-    if len(flat) != 16 or not all(isinstance(value, int | float) and abs(value) < 1e6 for value in flat):
-        raise PointsError(f"{name}: expected 16 numbers, got {values!r:.60}")
-    return np.array(flat, np.float64).reshape(4, 4)
+    return default if values is None else np.reshape(FIELDS.numbers(name, values, 16, -1e6, 1e6), (4, 4))
 
 
 @njit(cache=True, nogil=True)

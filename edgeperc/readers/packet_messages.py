@@ -241,9 +241,8 @@ class LidarMessages(_Turns):
 
         units = [] if message.unit is None else [message.unit]
         for stamp_ns, packet in message.packets:
-            if self._stream is None and (found := stream_of(self._path, packet, units, message.whose)) is not None:
-                self._stream, self._is_of = found
-            if self._stream is not None and self._is_of(packet):
+            self._stream = self._stream or stream_of(self._path, packet, units, message.whose)
+            if self._stream is not None and self._stream.row.fits(packet):
                 yield from map(self._of_computer, self._stream.add(packet))
                 self._last_s = 1e-9 * stamp_ns if stamp_ns else stamp_s
 

@@ -74,6 +74,11 @@ class Format(NamedTuple):
         """Whether a calibration of one can be read as that of the other."""
         return (self.is_hesai, self.spins, self.n_lasers) == (other.is_hesai, other.spins, other.n_lasers)
 
+    def fits(self, payload: memoryview) -> bool:
+        """Whether it is a packet of this format."""
+        found = format_of(payload)
+        return found is not None and (found == self or self.name == ALIKE.get(found.name))
+
     @property
     def block_bytes(self) -> int:
         """From one block to the next."""
@@ -409,7 +414,7 @@ class SpinningStream:
     """Turns from the packets of a sensor, by their format and the angles of the unit."""
 
     def __init__(self, row: Format, angles: Angles) -> None:
-        self._row, self._angles = row, angles
+        self.row, self._angles, self._clock = row, angles, row.clock
         self._order: Literal["<", ">"] = "<" if row.is_hesai else ">"
         self._packets: list[_Packet] = []
         self._last_deg, self._size, self._newest = np.nan, 0, Newest()
@@ -441,22 +446,22 @@ class SpinningStream:
 
     def azimuths_of(self, payload: memoryview) -> list[float]:
         """The azimuths of a packet's blocks [deg]; NaN where one is impossible."""
-        row = self._row
+        row = self.row
         hundredths = [struct.unpack_from(f"{self._order}H", payload, at + row.first - 2)[0] for at in row.blocks_at]
         return [0.01 * each if each < 36_000 else np.nan for each in hundredths]
 
     def _packet(self, payload: memoryview) -> _Packet:
-        row = self._row
+        row, at = self.row, self._clock.at
         # A Ruby counts microseconds by its manual, and nanoseconds by its maker's driver.
-        if row.header == 80 and int.from_bytes(payload[row.clock.at + 6 : row.clock.at + 10], "big") >= 10**6:
-            row = self._row = row._replace(clock=Clock("nanoseconds", row.clock.at))
+        if row.header == 80 and int.from_bytes(payload[at + 6 : at + 10], "big") >= 10**6:
+            self._clock = clock = Clock("nanoseconds", at)
             # In the first millisecond of a second, both look alike.
-            self._packets = [each._replace(time_s=time_of(row, memoryview(each.content))) for each in self._packets]
+            self._packets = [each._replace(time_s=time_of(clock, memoryview(each.content))) for each in self._packets]
         azimuths = np.array(self.azimuths_of(payload))
         speed_at = row.clock.speed_at
         rpm = row.rpm * struct.unpack_from("<H", payload, speed_at)[0] if speed_at else self._angles.rpm
         is_likely = _SPEEDS[0] <= rpm <= _SPEEDS[1]
-        return _Packet(bytes(payload), time_of(row, payload), rpm if is_likely else 600.0, azimuths)
+        return _Packet(bytes(payload), time_of(self._clock, payload), rpm if is_likely else 600.0, azimuths)
 
     def _turn(self, packet: _Packet, begin: int, end: int) -> Iterator[TimedScan]:
         """The packets so far and some blocks of another one; nothing, if there is no block among them."""
@@ -465,7 +470,7 @@ class SpinningStream:
         azimuths = np.array([each.azimuths for each in packets])
         if np.isnan(azimuths).all():
             return
-        row = self._row
+        row = self.row
         unit_m = 1e-3 * packets[0].content[row.mm_at] if row.mm_at else row.unit_m
         content = np.frombuffer(b"".join(each.content for each in packets), np.uint8).reshape(len(packets), -1)
         is_dual = row.lasers == 16 and self._angles.is_dual
@@ -512,9 +517,9 @@ def _beams(row: Format, angles: Angles, is_dual: bool) -> Floats:
     return np.stack([np.radians(elevation), azimuth, fires_us], axis=-1)
 
 
-def time_of(row: Format, payload: memoryview) -> float:
+def time_of(clock: Clock, payload: memoryview) -> float:
     """The time that a packet states [s]."""
-    kind, at, micros_at, _ = row.clock
+    kind, at, micros_at, _ = clock
     if kind in ("seconds", "nanoseconds"):
         high, low, rest = struct.unpack_from(">HII", payload, at)
         return float((high << 32 | low) + (1e-6 if kind == "seconds" else 1e-9) * rest)

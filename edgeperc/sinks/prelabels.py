@@ -19,13 +19,14 @@ from ..errors import CalibrationError, EdgepercError, OptionError
 from ..records import PerceivedScan
 from ..system.atomic import part_of, write_atomic
 from ..system.fields import OPTIONS
+from ..system.names import stem_of
 from ..system.printable import many
 from ..types.choices import VEHICLES
 from ..types.geometry import wrapped
 from ..types.perception import Box, Perception
 from ..types.points import Floats
 from ..view.content import edges_ahead
-from .run_file import RunFile, ScanFiles, stem_of, warn_of
+from .run_file import RunFile, ScanFiles, warn_of
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Track, Tracks

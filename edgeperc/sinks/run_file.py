@@ -12,15 +12,6 @@ from threading import Thread
 from ..errors import OptionError
 from ..system.atomic import beside, name_part, name_whole, write_atomic
 
-_SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
-
-
-def stem_of(name: str) -> tuple[str, str]:
-    """Name of a scan without folder and suffix, and its suffix in lower case, none for a capture's or an image's."""
-    last = Path(name).name
-    suffix = next((ending for ending in _SUFFIXES if last.lower().endswith(ending)), "")
-    return (last[: -len(suffix)] if suffix else Path(last).stem), suffix
-
 
 class ScanFiles:
     """The files of one run in one folder: each scan has its own, and none replaces a scan."""

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from ..errors import OptionError, PointsError
 from ..records import PerceivedScan
 from ..system.fields import OPTIONS
+from ..system.names import stem_of
 from ..system.remote import location
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import Floats32, Mask, as_points
-from .run_file import ScanFiles, stem_of
+from .run_file import ScanFiles
 
 __all__ = ["StaticSink"]
 

@@ -26,22 +26,21 @@ logger = logging.getLogger(__name__)
 
 PACKAGE = "edgeperc"
 
-# Kernels that Python calls, by what needs them; tests compare them with what is compiled.
+# Kernels that Python calls, by what needs them, such as a view; tests compare them with what is compiled.
 KERNELS: Mapping[str, str] = MappingProxyType(
     {
         "scans": "ground.planes.fill_lowest ground.planes.fit_first_plane preprocess.condition.fill_rendered "
         "preprocess.health.fill_lacking preprocess.health.fill_sectors preprocess.health.mark_isolated "
         "preprocess.returns.fill_returns preprocess.returns.has_returns_only types.frame.fill_moved",
-        "views": "inference.decode.fill_labels inference.projection.fill_image",
+        "views": "inference.crop.fill_rows inference.decode.fill_labels inference.projection.fill_image",
         "curvature": "inference.projection.fill_curvature",
         "fitness": "preprocess.fitness.fill_scan_sums",
-        "crop": "inference.crop.fill_rows",
         "gaps": "preprocess.interpolation.fill_between",
         "sensor": "preprocess.sensor_estimate.fill_votes",
         "turn": "types.frame.fill_turned",
         "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels "
         "ground.planes.fill_planes ground.planes.taken_cells",
-        "points": "inference.crop.fill_spread inference.projection.mark_range_image "
+        "range_image": "inference.crop.fill_spread inference.projection.mark_range_image "
         "objects.refine.fill_point_labels objects.refine.fill_without_outliers",
         "clusters": "objects.linkage.chain_points objects.linkage.fill_clusters",
         "boxes": "objects.boxes.fill_rectangle objects.cluster.fill_cluster_labels objects.cluster.fill_groups "
@@ -55,7 +54,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "agreement.rules.fill_support agreement.votes.apply_verdicts agreement.votes.fill_tallies "
         "agreement.votes.fill_verdicts agreement.votes.fill_votes objects.persons.complete_persons",
         "standing": "agreement.rules.sum_inside",
-        "road": "ground.observed.fill_lowest_returns ground.observed.follow_rays ground.observed.mark_cells "
+        "top_view": "ground.observed.fill_lowest_returns ground.observed.follow_rays ground.observed.mark_cells "
         "inference.projection.mark_top_view road.ahead.fill_corridor road.ahead.fill_first_cells "
         "road.outline.fill_grown road.outline.fill_rings road.outline.mark_connected "
         "road.outline.mark_needed road.outline.merge_corners road.outline.resolve_contacts "
@@ -66,7 +65,7 @@ KERNELS: Mapping[str, str] = MappingProxyType(
         "pillars": "inference.box_heads.count_not_finite inference.pillars.fill_pillars "
         "inference.pillars.find_pillars types.geometry.fill_oriented_iou types.geometry.mark_nms",
         "blocks": "inference.decode.fill_pixels",
-        "image": "camera.image.fill_image_labels camera.image.fill_scaled",
+        "camera": "camera.image.fill_image_labels camera.image.fill_scaled",
     }
 )
 

@@ -11,6 +11,7 @@ from ..errors import OptionError
 from .fields import OPTIONS
 
 MAX_NAME = 200
+SCAN_SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 _PICTURES = {
     f".{kind}" for kind in ("avi", "bmp", "gif", "jpeg", "jpg", "mp4", "pdf", "png", "svg", "tif", "tiff", "webp")
 }
@@ -27,6 +28,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
     match = difflib.get_close_matches(name[:_MAX_COMPARED], [*known], 1)
     return f" (did you mean {match[0]}?)" if match else ""
+
+
+def stem_of(name: str) -> tuple[str, str]:
+    """Name of a scan without folder and suffix, and its suffix in lower case, none for a capture's or an image's."""
+    last = PurePath(name).name
+    suffix = next((ending for ending in SCAN_SUFFIXES if last.lower().endswith(ending)), "")
+    return (last[: -len(suffix)] if suffix else PurePath(last).stem), suffix
 
 
 def by_number(path: PurePath | str) -> tuple[list[str | int], str]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from edgeperc.inference.box_heads import STRIDE
 from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from edgeperc.types.points import Floats, Floats32, Mask
 from edgeperc.types.views import TopViewGeometry
 
-STRIDE = 4
-"""Top-view cells along the edge of one output cell of head "dense"."""
 SLOT_CELLS = 32
 """Top-view cells along the edge of the square that belongs to one slot: five poolings by two. The last row and column
 of squares also get the cells that are left over."""

@@ -36,7 +36,6 @@ from tqdm import tqdm
 
 from edgeperc.datasets.images import LabeledImages, image_hash
 from edgeperc.datasets.kitti import SEQUENCE_DRIVES, KittiObjects, SemanticKitti, scan_hash
-from edgeperc.datasets.layout import SUFFIXES
 from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.datasets.splits import in_split
 from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
@@ -52,6 +51,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation import samples
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.system.names import SCAN_SUFFIXES
 from edgeperc.types.card import ModelCard
 from edgeperc.types.points import Floats, Floats32, Ints64
 
@@ -169,9 +169,9 @@ def calibration_scans(
 
 
 def _scans_in(folder: Path) -> list[Path]:
-    files = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(SUFFIXES))
+    files = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(SCAN_SUFFIXES))
     if not files:
-        raise PointsError(f"no scan to calibrate on in {folder}; expected files named {', '.join(SUFFIXES)}")
+        raise PointsError(f"no scan to calibrate on in {folder}; expected files named {', '.join(SCAN_SUFFIXES)}")
     return files
 
 

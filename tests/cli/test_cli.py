@@ -30,7 +30,7 @@ from edgeperc import Tracker, __version__, live, zoo
 from edgeperc.cli.evaluation.scans import figure_lines
 from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
-from edgeperc.cli.report import Report
+from edgeperc.cli.report import Outcome, Report
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
 from edgeperc.evaluation.judge import Perceiving
@@ -1010,7 +1010,7 @@ def test_one_reason_is_written_out_once(capsys: pytest.CaptureFixture[str]) -> N
     for k, error in enumerate(
         ("farther than 12.5 m: pass sensor= a profile", "farther than 9 m: pass sensor= a profile", "x")
     ):
-        report.add(Path(f"{k}.bin"), PointsError(error))
+        report.add(Outcome(Path(f"{k}.bin"), PointsError(error)))
     assert capsys.readouterr().err.splitlines() == [
         "edgeperc: 0.bin: farther than 12.5 m: pass --sensor a profile",
         "edgeperc: 1.bin: the same as 0.bin",

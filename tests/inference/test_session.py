@@ -465,5 +465,5 @@ def test_auto_takes_the_setting_that_was_measured_here(
 
 @pytest.mark.parametrize("n_threads", [0, -1, 4097, 10**400])
 def test_the_number_of_threads_is_bounded(n_threads: int) -> None:
-    with pytest.raises(errors.OptionError, match=f"n_threads is {n_threads!r:.20}; expected 1 to 4096"):
+    with pytest.raises(errors.OptionError, match=r"n_threads is -?[0-9.]+; expected a whole number from 1 to 4096"):
         Session(model_path("pointseg"), "cpu", n_threads=n_threads)

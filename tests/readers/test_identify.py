@@ -326,6 +326,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         cards = ()
 
         def __init__(self, *_: Any, sensor: Any, **__: Any) -> None:
+            self.sensor = sensor
             sensors.append(sensor)
 
         def __call__(self, points: Any, stamp_s: Any = None, **_: Any) -> Any:

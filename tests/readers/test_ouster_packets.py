@@ -204,7 +204,7 @@ def test_real_captures_and_metadata(data_root: Callable[[str], Path], tmp_path: 
     ("content", "error"),
     [
         ([], "expected an object, got list"),
-        ({}, "beam_altitude_angles: expected a list"),
+        ({}, "beam_altitude_angles is None; expected a list of numbers"),
         ({**METADATA, "sensor_info": None}, "lacks sensor_info"),
         (changed(lidar_data_format__udp_profile_lidar="RNG99"), "'RNG99' is not decoded; known are LEGACY"),
         (changed(lidar_data_format__udp_profile_lidar=["LEGACY"]), "is not decoded"),
@@ -214,11 +214,11 @@ def test_real_captures_and_metadata(data_root: Callable[[str], Path], tmp_path: 
             "at most 65,507",
         ),
         (changed(beam_intrinsics__beam_altitude_angles=[0.0] * 8), "several beams have the same angle"),
-        (changed(beam_intrinsics__beam_altitude_angles=[[0.0]] * 8), "one for each beam"),
-        (changed(beam_intrinsics__beam_to_lidar_transform=[1, 2, 3]), "expected 16 numbers"),
-        (changed(lidar_intrinsics__lidar_to_sensor_transform=[float("nan")] * 16), "expected 16 numbers"),
-        (changed(beam_intrinsics__lidar_origin_to_beam_origin_mm="15"), "expected a number, got '15'"),
-        (changed(sensor_info__initialization_id=[1]), "initialization_id: expected a number"),
+        (changed(beam_intrinsics__beam_altitude_angles=[[0.0]] * 8), r"angles\[0\] is \[0.0\]; expected a number"),
+        (changed(beam_intrinsics__beam_to_lidar_transform=[1, 2, 3]), "expected a list of 16 numbers"),
+        (changed(lidar_intrinsics__lidar_to_sensor_transform=[float("nan")] * 16), r"transform\[0\] is nan"),
+        (changed(beam_intrinsics__lidar_origin_to_beam_origin_mm="15"), "is '15'; expected a number"),
+        (changed(sensor_info__initialization_id=[1]), r"initialization_id is \[1\]; expected a number"),
     ],
 )  # fmt: skip
 def test_metadata_that_says_nothing_possible(content: Any, error: str) -> None:

@@ -476,7 +476,7 @@ def test_an_ousters_packets_give_the_turns_of_a_capture(tmp_path: Path, version:
     [
         ("", "has no metadata of the sensor; expected it as a text, topic /ouster/metadata"),
         ("{", "the Ouster's metadata in the bag cannot be read"),
-        ("{}", "beam_altitude_angles: expected a list"),
+        ("{}", "beam_altitude_angles is None; expected a list"),
     ],
 )
 def test_an_ousters_packets_without_metadata(tmp_path: Path, metadata: str, error: str) -> None:

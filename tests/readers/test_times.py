@@ -350,13 +350,13 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.bag", [1700.0, 1700.1])
     times = 1699.5 + 0.1 * np.arange(10)
     poses = write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
-    straightener = Straightener(Trajectory.from_tum(poses))
+    straightener = Straightener(Trajectory.from_tum(poses), deskews=True)
     for scan in read_timed_scans(path):
         assert off_the_walls(straightener.straighten(*scan)) < 1e-3
     write_tum(poses, times + 5.0, [pose_at(t) for t in 0.1 * np.arange(10)])
     with pytest.raises(edgeperc.StampError, match="poses around it"):
-        Straightener(Trajectory.from_tum(poses)).straighten(*scan)
-    straightener = Straightener(true_trajectory())
+        Straightener(Trajectory.from_tum(poses), deskews=True).straighten(*scan)
+    straightener = Straightener(true_trajectory(), deskews=True)
     for stamp_s in (None, 0.2):  # a file with times from 0 may be on a clock that begins there; two are not
         straightener.straighten(stamp_s, scan.points, scan.times_s - scan.times_s[0])
     with pytest.raises(edgeperc.StampError, match="begin anew with each scan"):
@@ -366,7 +366,7 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
 @pytest.mark.compiled
 def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
     """The tracker knows the motion from the second scan on."""
-    straightener, straight = Straightener(None), []
+    straightener, straight = Straightener(None, deskews=True), []
     for k, scan in enumerate(read_timed_scans(drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2, 1700.3]))):
         if k == 0:
             with pytest.warns(UserWarning, match="first two scans stay"):
@@ -383,7 +383,7 @@ def test_scans_are_straight_at_their_stamps(stamp_s: float) -> None:
     """Those of drivers are rounded and their first beams dropped: such scans were a turn's motion off, now and then."""
     points, times = turn(1700.1)
     motion = Motion.between(pose_at(0.0), 0.0, pose_at(0.1), 0.1)
-    straightener = Straightener(None)
+    straightener = Straightener(None, deskews=True)
     for k in range(2):
         straightener.follow(tracks_at(0.1 * k, pose_at(0.1 * k)))
     wanted = deskew(points, times, motion, at_s=float(times.max()) if stamp_s == 5.0 else stamp_s)
@@ -408,7 +408,7 @@ def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) 
         ([first, wrong, second], False),
         ([first, second, wrong, first, second], True),
     ):
-        straightener = Straightener(None)
+        straightener = Straightener(None, deskews=True)
         for tracks in followed:
             straightener.follow(tracks)
         assert (off_the_walls(straightener.straighten(*scan)) < 1e-3) == is_straight
@@ -416,9 +416,9 @@ def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) 
 
 def test_scans_without_times_are_not_straightened() -> None:
     with pytest.raises(edgeperc.PointsError, match=r"the scan has no times of points: .* leave out --deskew"):
-        Straightener(None).straighten(1.0, np.zeros((8, 4), np.float32), None)
+        Straightener(None, deskews=True).straighten(1.0, np.zeros((8, 4), np.float32), None)
     points = np.zeros((8, 4), np.float32)
-    assert Straightener(None).straighten(1.0, points, np.full(8, np.nan)) is points
+    assert Straightener(None, deskews=True).straighten(1.0, points, np.full(8, np.nan)) is points
 
 
 def test_a_scan_that_the_poses_do_not_cover_fails_alone(

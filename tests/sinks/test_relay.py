@@ -194,7 +194,7 @@ def test_files_are_finished_before_what_is_served(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(McapSink, "close", close)
     monkeypatch.setattr(ServeSink, "close", close)
-    arguments = argparse.Namespace(**dict.fromkeys(SINKS), live=False)
+    arguments = argparse.Namespace(**dict.fromkeys(SINKS), live=False, gif=False)
     arguments.mcap, arguments.serve = tmp_path / "run.mcap", ("127.0.0.1", 0)
     with Sinks(arguments):
         assert not closed

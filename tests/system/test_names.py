@@ -21,8 +21,7 @@ from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import CardError, OptionError, PointsError, SensorError
 from edgeperc.records import PerceivedScan
 from edgeperc.sinks.prelabels import KINDS, PrelabelSink
-from edgeperc.sinks.run_file import stem_of
-from edgeperc.system.names import check_file, check_name, check_text
+from edgeperc.system.names import check_file, check_name, check_text, stem_of
 from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
