@@ -87,8 +87,8 @@ def add_sensor(group: Options, *, of_capture: bool = False) -> None:
     default = "auto" if of_capture else DEFAULT_SENSOR
     group(
         "--sensor SENSOR",
-        "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, lyft, "
-        "nuscenes, once, pandaset, semantickitti, vod, waymo), a .json file written by 'edgeperc "
+        "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, kitti-raw, "
+        "kitti-tracking, lyft, nuscenes, once, pandaset, semantickitti, vod, waymo), a .json file written by 'edgeperc "
         "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
         f"are found in the points of the first scans (default: {default})",
         default=None if of_capture else DEFAULT_SENSOR,

@@ -29,10 +29,11 @@ def add_parser(commands: Commands) -> None:
             "sensors",
             sensors_command,
             "the built-in sensors: beams, field of view, remission",
-            "List the built-in sensors. Pass a name to --sensor, or a public set: av2, "
-            "ddad, lyft, nuscenes, once, pandaset, semantickitti, vod, waymo. For another sensor, pass a .json file, "
-            "see 'edgeperc fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is mapped to, "
-            "'gathered' the time of a scan of one that does not spin, with the beams and columns that then show.",
+            "List the built-in sensors. Pass a name to --sensor, or a public set: av2, ddad, kitti-raw, kitti- "
+            "tracking, lyft, nuscenes, once, pandaset, semantickitti, vod, waymo. For another sensor, pass a .json "
+            "file, see 'edgeperc fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is "
+            "mapped to, 'gathered' the time of a scan of one that does not spin, with the beams and columns that "
+            "then show.",
         ),
         (
             "providers",

@@ -582,6 +582,8 @@ PUBLIC_SENSORS: Mapping[str, SensorProfile] = MappingProxyType(
     {
         "av2": replace(SENSORS["vlp-32c"], name="av2", elevations_deg=_TWO_VLP_32C, remission_range=(0.0, 1.0)),
         "ddad": SensorProfile("ddad", np.linspace(10.0, -30.0, 64).round(2).tolist(), 720, max_range_m=250.0),
+        "kitti-raw": SENSORS["hdl-64e"],
+        "kitti-tracking": SENSORS["hdl-64e"],
         "lyft": SensorProfile("lyft", _LYFT, 1800, _BYTE, max_range_m=200.0),
         "nuscenes": SENSORS["hdl-32e"],
         "once": SENSORS["pandar40p"],

@@ -23,7 +23,18 @@ TRAINED_GAP_DEG = 0.9  # median gap of the beams that is drawn for sparse sensor
 # The training sensor is not drawn; nor are those that came after the shipped networks were trained, whose recipes make
 # the same samples again.
 _NOT_DRAWN = {
-    *("hdl-64e", "semantickitti", "vod", "vlp-16-hi-res", "vls-128", "pandar40p", "pandarqt-64", "pandarxt-32m"),
+    *(
+        "hdl-64e",
+        "kitti-raw",
+        "kitti-tracking",
+        "semantickitti",
+        "vod",
+        "vlp-16-hi-res",
+        "vls-128",
+        "pandar40p",
+        "pandarqt-64",
+        "pandarxt-32m",
+    ),
     *("ot128", "jt128", "helios-32", "helios-16", "rs-bpearl", "ruby-plus-128", "once", "waymo"),
 }
 KNOWN = tuple(sensor for name, sensor in {**SENSORS, **PUBLIC_SENSORS}.items() if name not in _NOT_DRAWN)
