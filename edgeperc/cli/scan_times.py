@@ -67,8 +67,10 @@ def times_of_set(scans: Sequence[Path | Remote]) -> dict[Path | Remote, float]:
 
 def is_of_kitti(poses: Path) -> bool:
     """Whether a file of poses has the twelve numbers of KITTI's format in its first line."""
-    with poses.open("rb") as file:
-        lines = (line.partition(b"#")[0].split() for line in file.read(_MOST_HEAD).splitlines())
+    head = b""
+    with suppress(OSError), poses.open("rb") as file:  # what reads the file tells that it cannot be read
+        head = file.read(_MOST_HEAD)
+    lines = (line.partition(b"#")[0].split() for line in head.splitlines())
     return len(next(filter(None, lines), ())) == _N_KITTI
 
 

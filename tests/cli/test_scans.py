@@ -298,3 +298,5 @@ def test_poses_in_the_format_of_kitti_need_no_option(
     assert ("by their way, these are poses of a camera" in shell.err(*tracked, code=2 * of_camera)) == of_camera
     (root / "times.txt").unlink()
     assert "poses in KITTI's format have no times; pass those of the scans: --times FILE" in shell.err(*tracked)
+    (root / "poses.txt").unlink()
+    assert "poses.txt cannot be read as poses" in shell.err(*tracked)
