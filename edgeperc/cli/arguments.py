@@ -13,7 +13,7 @@ from typing import Any
 from ..inference import providers
 from ..system.remote import Remote, location
 from ..types import choices
-from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR, WEIGHTS
+from ..types.choices import DEFAULT_MODELS, DEFAULT_SENSOR, PUBLIC_SETS, WEIGHTS
 
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
@@ -87,9 +87,9 @@ def add_sensor(group: Options, *, of_capture: bool = False) -> None:
     default = "auto" if of_capture else DEFAULT_SENSOR
     group(
         "--sensor SENSOR",
-        "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set (av2, ddad, kitti-raw, "
-        "kitti-tracking, lyft, nuscenes, once, pandaset, semantickitti, vod, waymo), a .json file written by 'edgeperc "
-        "fit-sensor' or 'edgeperc info --write', or auto: the one that a capture names, otherwise the one whose beams "
+        "the LiDAR that recorded the scans: a name from 'edgeperc sensors', a public set "
+        f"({', '.join(PUBLIC_SETS)}), a .json file written by 'edgeperc fit-sensor' or 'edgeperc info --write', or "
+        "auto: the one that a capture names, otherwise the one whose beams "
         f"are found in the points of the first scans (default: {default})",
         default=None if of_capture else DEFAULT_SENSOR,
     )

@@ -10,7 +10,7 @@ from dataclasses import fields
 from typing import Any
 
 from ..errors import SettingsError
-from ..types.choices import DEFAULT_SENSOR
+from ..types.choices import DEFAULT_SENSOR, PUBLIC_SETS
 from .arguments import Commands, add_command, options
 from .output import print_columns, print_line
 
@@ -29,11 +29,10 @@ def add_parser(commands: Commands) -> None:
             "sensors",
             sensors_command,
             "the built-in sensors: beams, field of view, remission",
-            "List the built-in sensors. Pass a name to --sensor, or a public set: av2, ddad, kitti-raw, kitti- "
-            "tracking, lyft, nuscenes, once, pandaset, semantickitti, vod, waymo. For another sensor, pass a .json "
-            "file, see 'edgeperc fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is "
-            "mapped to, 'gathered' the time of a scan of one that does not spin, with the beams and columns that "
-            "then show.",
+            f"List the built-in sensors. Pass a name to --sensor, or a public set: {', '.join(PUBLIC_SETS)}. For "
+            "another sensor, pass a .json file, see 'edgeperc fit-sensor'. 'mapped to' is the sensor whose remission "
+            "scale the remission is mapped to, 'gathered' the time of a scan of one that does not spin, with the beams "
+            "and columns that then show.",
         ),
         (
             "providers",

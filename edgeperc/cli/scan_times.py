@@ -87,12 +87,15 @@ def kitti_trajectory(poses: Path, times: Path | None) -> Trajectory:
         raise StampError(
             f"--poses {poses}: poses in KITTI's format have no times; pass those of the scans: --times FILE"
         )
-    beside = [folder / "calib.txt" for folder in (times.parent, *folders)]
-    places = [(f"the camera of {path}", read_kitti_calibration(path)[0]) for path in beside if path.is_file()][:1]
+    times_s = _read_times(times)
+    places: list[tuple[str, Floats | None]] = []
+    beside = (folder / "calib.txt" for folder in (times.parent, *folders))
+    if (calibration := next(filter(Path.is_file, beside), None)) is not None:
+        places.append((f"the camera of {calibration}", read_kitti_calibration(calibration)[0]))
     errors = []
     for whose, place in (*places, ("the sensor", None)):
         try:
-            found = Trajectory.from_kitti(poses, _read_times(times), T_camera_sensor=place)
+            found = Trajectory.from_kitti(poses, times_s, T_camera_sensor=place)
         except TrackingError as exc:  # by their way, they may be those of the other
             errors.append(exc)
         else:

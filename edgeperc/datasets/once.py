@@ -23,7 +23,7 @@ class Once(Tree):
     """
 
     def __init__(self, root: Path) -> None:
-        self.point_names, self._rows = {}, lru_cache(maxsize=2)(_annotated)
+        self._rows = lru_cache(maxsize=2)(_annotated)
         depths = ("", "data/", "*/data/")
         found = (path for depth in depths for path in sorted(root.glob(f"{depth}[0-9]*/[0-9]*.json")))
         files = {
@@ -49,7 +49,7 @@ class Once(Tree):
                 boxes.append(upright_box(kind, (-y, x, z), (length, width, height), turned))
         except (KeyError, TypeError, ValueError) as exc:
             raise PointsError(f"{document}: a box of {path.stem} is none of ONCE's ({exc!s:.200})") from exc
-        return Labeled(points, boxes, None, None)
+        return Labeled(points, boxes)
 
 
 def _annotated(path: Path) -> dict[str, _Rows]:

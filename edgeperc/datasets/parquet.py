@@ -60,10 +60,18 @@ def _rows(table: Any, columns: tuple[str, ...]) -> list[_Row]:
 
 @contextmanager
 def _reading(path: Path, columns: Iterable[str]) -> Iterator[Any]:
-    """The open file; what is wrong with it is a `PointsError`."""
-    arrow = require("pyarrow", "argoverse", f"{path}: a Parquet file")
-    parquet = require("pyarrow.parquet", "argoverse", f"{path}: a Parquet file", package="pyarrow")
-    try:
+    """The open file."""
+    with arrow_module("parquet", path, columns) as parquet:
         yield parquet.ParquetFile(path)
+
+
+@contextmanager
+def arrow_module(name: str, path: Path, columns: Iterable[str]) -> Iterator[Any]:
+    """The module of pyarrow for the format of a file; what is wrong with it is a `PointsError`."""
+    what = f"{path}: a {name.capitalize()} file"
+    arrow = require("pyarrow", "argoverse", what)
+    module = require(f"pyarrow.{name}", "argoverse", what, package="pyarrow")
+    try:
+        yield module
     except (OSError, arrow.ArrowException, KeyError, ValueError) as exc:
         raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..readers.files import read_points
-from ..system.extras import require
 from ..types.frame import poses_of, turned
 from ..types.perception import Box
 from ..types.points import Floats
@@ -23,6 +22,7 @@ from .kitti import read_numbers
 from .kitti_trees import KittiRaw, KittiTracking, ViewOfDelft
 from .layout import WITH_RIDER, point_names_of
 from .once import Once
+from .parquet import arrow_module
 from .pickled import read_pickled
 from .tree import Labeled, Tree, present
 from .waymo import Waymo
@@ -83,7 +83,7 @@ class NuScenes(Tree):
                 raise PointsError(f"{self._tables}/sample_annotation.json: a box of {name} is none ({exc})") from exc
         file = self._numbers.get(frame.token)
         numbers = None if file is None else read_numbers(file, len(points))
-        return Labeled(turned(points, -ahead) if ahead else points, boxes, numbers, None)
+        return Labeled(turned(points, -ahead) if ahead else points, boxes, numbers)
 
     def _key_frames(self) -> tuple[dict[str, tuple[_Frame, Floats]], dict[str, Path]]:
         """The key frames whose files are there, with the pose of their LiDAR in the vehicle; and these files."""
@@ -176,7 +176,6 @@ class Argoverse2(Tree):
     """
 
     def __init__(self, root: Path) -> None:
-        self.point_names = {}
         logs = [path.parent for depth in ("", "*/", "*/*/") for path in root.glob(f"{depth}annotations.feather")]
         if not logs:
             raise PointsError(f"{root} has no annotations.feather; expected LOG/annotations.feather, or SPLIT/LOG")
@@ -293,7 +292,7 @@ class PandaSet(Tree):
             raise
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as exc:
             raise PointsError(f"{path}, its labels or its poses.json are not as PandaSet's ({exc!r:.100})") from exc
-        return Labeled(points, boxes, numbers, None)
+        return Labeled(points, boxes, numbers)
 
 
 def _annotations(scan: Path) -> tuple[Path, Path]:
@@ -319,14 +318,10 @@ _RIGHT_TO_AHEAD = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0
 
 def _feather(path: Path, *columns: str) -> dict[str, NDArray[Any]]:
     """Columns of a table. Raises PointsError."""
-    arrow = require("pyarrow", "argoverse", f"{path}: a Feather file")
-    feather = require("pyarrow.feather", "argoverse", f"{path}: a Feather file", package="pyarrow")
-    try:
+    with arrow_module("feather", path, columns) as feather:
         table = feather.read_table(path, columns=list(columns), memory_map=False)
         table.validate(full=True)
         return {name: table.column(name).to_numpy() for name in columns}
-    except (OSError, arrow.ArrowException, KeyError, ValueError) as exc:
-        raise PointsError(f"{path} cannot be read ({exc!s:.200}); expected columns {', '.join(columns)}") from exc
 
 
 def _folder_of_tables(root: Path) -> Path:

@@ -95,7 +95,7 @@ class Waymo(Tree):
             ]
         if "lidar_segmentation" in files and (_TOP, stamp) in self._of(segment, "lidar_segmentation").groups:
             numbers = self._image(segment, "lidar_segmentation", stamp, 2)[is_point][:, 1].astype(np.uint64)
-        return Labeled(points, boxes, numbers, None)
+        return Labeled(points, boxes, numbers)
 
     def _of(self, segment: str, part: str) -> LargeRows:
         column = f"[{_IMAGES[part]}Component].range_image_return1"

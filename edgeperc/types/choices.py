@@ -8,6 +8,20 @@ SPARSE_MODELS = {"pointseg": "pointseg-sparse"}
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 AUTO_SENSOR = "auto"  # found in the points
+PUBLIC_SETS = (
+    "av2",
+    "ddad",
+    "kitti-raw",
+    "kitti-tracking",
+    "lyft",
+    "nuscenes",
+    "once",
+    "pandaset",
+    "semantickitti",
+    "vod",
+    "waymo",
+)
+"""Names of `edgeperc.datasets.layout.known_layouts`."""
 PRECISIONS = ("fp32", "bf16", "int8")
 PLACES = ("street", "hall", "yard")
 """Kinds of places that are simulated."""

@@ -209,15 +209,9 @@ def test_any_times_are_read_or_a_typed_error(text: str) -> None:
         assert np.isfinite(times).all()
 
 
-@pytest.mark.filterwarnings("default")
-def test_scan_files_with_times_have_poses(tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without times of their points, they are tracked, and several are looked at, at the poses of a file."""
-    for number in (3, 4, 6):
-        write_scan(tmp_path / "drive" / f"{number}.bin")
-    (tmp_path / "times.txt").write_text("".join(f"{10.0 + 0.2 * k}\n" for k in range(8)))
-    poses = "".join(f"{10.0 + 0.2 * k} {2.0 * k} 0 0 0 0 0 1\n" for k in range(8))
-    (tmp_path / "poses.txt").write_text(poses)
-    tracked = [tmp_path / "drive", "--anyway", "--track", "--poses", tmp_path / "poses.txt"]
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, float]]:
+    """Time and x of the poses that the tracker is given."""
     update, seen = Tracker.update, list[tuple[float, float]]()
 
     def note(self: Tracker, boxes: Any, stamp_s: float, pose: Any = None, **how: Any) -> Any:
@@ -226,6 +220,18 @@ def test_scan_files_with_times_have_poses(tmp_path: Path, shell: Shell, monkeypa
         return update(self, boxes, stamp_s, pose, **how)
 
     monkeypatch.setattr(Tracker, "update", note)
+    return seen
+
+
+@pytest.mark.filterwarnings("default")
+def test_scan_files_with_times_have_poses(tmp_path: Path, shell: Shell, seen: list[tuple[float, float]]) -> None:
+    """Without times of their points, they are tracked, and several are looked at, at the poses of a file."""
+    for number in (3, 4, 6):
+        write_scan(tmp_path / "drive" / f"{number}.bin")
+    (tmp_path / "times.txt").write_text("".join(f"{10.0 + 0.2 * k}\n" for k in range(8)))
+    poses = "".join(f"{10.0 + 0.2 * k} {2.0 * k} 0 0 0 0 0 1\n" for k in range(8))
+    (tmp_path / "poses.txt").write_text(poses)
+    tracked = [tmp_path / "drive", "--anyway", "--track", "--poses", tmp_path / "poses.txt"]
     answers = shell.records("run", *tracked, "--times", tmp_path / "times.txt", "--sweeps", "3")
     assert [answer["stamp_s"] for answer in answers] == pytest.approx([10.6, 10.8, 11.2])
     np.testing.assert_allclose(seen, [(10.6, 0.0), (10.8, 2.0), (11.2, 6.0)], atol=1e-6)
@@ -267,7 +273,7 @@ def test_the_times_of_kitti_are_found(scans_in: str, file: str, lines: list[str]
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("of_camera", [True, False])
 def test_poses_in_the_format_of_kitti_need_no_option(
-    of_camera: bool, tmp_path: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+    of_camera: bool, tmp_path: Path, shell: Shell, seen: list[tuple[float, float]]
 ) -> None:
     """The times and the calibration lie beside them, and whose they are is told by their way."""
     root, camera = tmp_path / "sequences/00", np.eye(4)
@@ -282,14 +288,6 @@ def test_poses_in_the_format_of_kitti_need_no_option(
     (root / "times.txt").write_text("".join(f"{0.2 * k:e}\n" for k in range(4)))
     place = " ".join(map(str, camera[:3].ravel()))
     (root / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 700 0 600 0 0 700 180 0 0 0 1 0\nTr: {place}\n")
-    update, seen = Tracker.update, list[tuple[float, float]]()
-
-    def note(self: Tracker, boxes: Any, stamp_s: float, pose: Any = None, **how: Any) -> Any:
-        if pose is not None:  # of the first one, which compiles
-            seen.append((stamp_s, float(pose[0][3])))
-        return update(self, boxes, stamp_s, pose, **how)
-
-    monkeypatch.setattr(Tracker, "update", note)
     tracked = ["run", root, "--anyway", "--track", "--poses", root / "poses.txt"]
     err = shell.err(*tracked, code=0)
     assert ("are those of the camera of" if of_camera else "are those of the sensor, at") in err

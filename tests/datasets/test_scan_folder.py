@@ -36,6 +36,7 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import SCENE_CLASSES
 from edgeperc.types.card import ModelCard
+from edgeperc.types.choices import PUBLIC_SETS
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
@@ -587,6 +588,7 @@ def test_descriptions_of_public_sets() -> None:
     kitti = ("kitti-raw", "kitti-tracking")
     others = ("lyft", "nuscenes", "once", "pandaset", "semantickitti", "vod", "waymo")
     assert known_layouts() == ("av2", "ddad", *kitti, *others)
+    assert known_layouts() == PUBLIC_SETS
     for name in known_layouts():
         layout = read_layout(name)
         assert layout.name == name

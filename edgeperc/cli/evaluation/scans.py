@@ -10,7 +10,7 @@ from typing import Any
 from ...system.extras import require
 from ...system.names import check_picture
 from ...system.printable import many
-from ...types.choices import CAMERA, RULES
+from ...types.choices import CAMERA, PUBLIC_SETS, RULES
 from ..arguments import (
     Commands,
     add_boxes,
@@ -52,7 +52,7 @@ def add_parser(commands: Commands) -> None:
         "datasets DATASET...",
         "the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
         "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
-        "public set (nuscenes, av2, pandaset, waymo, once, vod, ddad, lyft, semantickitti); or labeled images: a "
+        f"public set ({', '.join(PUBLIC_SETS)}); or labeled images: a "
         "folder with classes.json, train, trainannot, val, valannot as in CamVid",
     )
     reading(
